@@ -951,3 +951,28 @@ def test_two_samples_of_what_is_required_are_enough_in_the_part_that_is_kept(
         assert read(file, require=("x_dem",)).channels["x_dem"].t.tolist() == [0.0, 1.0]
     else:
         assert "no x_dem in the part of the log that is kept" in refused(file, require=("x_dem",))
+
+
+# ---- quotation marks -------------------------------------------------------------------------------------------------
+
+QUOTED = [f"{k},{50 + k},x" for k in range(40)]
+
+
+@pytest.mark.parametrize("cell", ['"', '"no', 'x"'])
+@pytest.mark.parametrize("row", [0, 17, 39])
+@pytest.mark.parametrize("long", [1, 8_000])
+def test_a_quotation_mark_that_nobody_closes_is_refused_with_its_row(
+    tmp_path: Path, cell: str, row: int, long: int
+) -> None:
+    lines = QUOTED * long
+    lines[row] = f"{row},{50 + row},{cell}"
+    text = "\n".join(["t,n_dem,remark", *lines, ""])
+    if cell[0] != '"':  # within a cell it is a letter
+        assert values(csv(tmp_path, "\n".join(["t,n_dem,remark", *lines[:40], ""]))) == [50.0 + k for k in range(40)]
+        return
+    assert f"row {row + 2}: a quotation mark opens a cell that no other one closes" in refused(csv(tmp_path, text))
+
+
+def test_a_cell_in_quotation_marks_may_hold_lines(tmp_path: Path) -> None:
+    text = 't,n_dem,remark\n0,50,"a ""b"" \n c, d"\n1,51,5"\n'
+    assert values(csv(tmp_path, text)) == [50.0, 51.0]

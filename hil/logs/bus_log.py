@@ -38,9 +38,10 @@ class Bus:
         self._silent: dict[str, str] = {}
         self._rows: dict[int, np.ndarray] = {}
         seen = np.unique(frames.ident)
-        groups = pgn(seen[seen >> 31 == 1])
+        groups = set(pgn(seen[seen >> 31 == 1]).tolist())
+        sent = set(seen.tolist())
         for m in messages:
-            here = m.ident in seen or (m.ident >> 31 and pgn(m.ident & 0x1FFFFFFF) in groups)
+            here = m.ident in sent or (m.ident >> 31 and int(pgn(m.ident & 0x1FFFFFFF)) in groups)
             for s in m.layout.signals:
                 key = f"{m.layout.name}.{s.name}"
                 if here:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.logs.source import ABSENT, Channel, LogError, Options, Source, numbers, read_bytes
+from hil.logs.source import ABSENT, Channel, LogError, Options, Source, numbers, read_bytes, second
 from hil.logs.table import Table, arrow_table, split_unit, time_column
 from hil.logs.times import from_dates
 from hil.logs.units import NO_UNIT, factor_of
@@ -23,6 +23,7 @@ _NO_SAMPLE = ["NA", "N/A", "null", "None", "-"]
 _MOST_COLUMNS = 10_000
 _BLOCK = 1 << 23  # bytes read at once; no row may be longer
 _INK = re.compile(rb"\S")
+_END = "\x1e\x1a"  # stands behind the last row, where none can be
 
 
 def open_csv(path: Path, options: Options) -> Source:
@@ -54,7 +55,7 @@ def open_csv(path: Path, options: Options) -> Source:
         raise LogError(f"{path}: header line cannot be read ({e}): {line[:80]!r}") from None
     if len(headers) > _MOST_COLUMNS:
         raise LogError(f"{path}: {len(headers)} columns; allowed: {_MOST_COLUMNS}")
-    again = next((h for i, h in enumerate(headers) if h in headers[:i] and h), None)
+    again = second(h for h in headers if h)
     if again is not None:
         raise LogError(f"{path}: column {again!r} is there more than once")
     under, behind = _line(raw, at)
@@ -94,8 +95,8 @@ def _units_row(row: bytes, headers: list[str], separator: str) -> dict[str, str]
 
 
 class _Csv:
-    """Rows of a CSV, from byte ``at`` of ``raw``; ``wanted`` columns are read together on the first call, any other
-    when asked for.
+    """Rows of a CSV, from byte ``at`` of ``raw``; ``wanted`` columns are read together on the first call, all others
+    together when one of them is asked for: a file is parsed three times at most, however many columns it has.
     """
 
     def __init__(
@@ -107,6 +108,7 @@ class _Csv:
         self.time, self.notes = time, list[str]()
         self.squared = False
         self.ready: dict[str, np.ndarray] | None = None
+        self.text: Any = None  # the columns that are not ready, as words
 
     def column(self, header: str) -> np.ndarray:
         import pyarrow as pa
@@ -114,11 +116,13 @@ class _Csv:
         if _INK.search(self.raw, self.at) is None:
             return np.empty(0)
         if self.ready is None:
+            if self.raw.count(b'"', self.at) % 2:
+                self._closed()
             try:
                 table = self._read(self.wanted, pa.float64())
                 self.ready = {h: numbers(table.column(h).combine_chunks()) for h in self.wanted}
             except pa.ArrowException:
-                self.ready = {}  # a cell that is no number: column by column
+                self.ready = {}  # a cell that is no number
         if header not in self.ready:
             self.ready[header] = self._numbers(header)
         return self.ready[header]
@@ -131,7 +135,8 @@ class _Csv:
         from pyarrow import csv as arrow
 
         places = [f"c{i}" for i in range(len(self.headers))]  # names of our own: the file's may be empty
-        wanted = [places[self.headers.index(h)] for h in columns]
+        place = dict(zip(self.headers, places, strict=True))
+        wanted = [place[h] for h in columns]
         ragged = False
 
         def other_length(row: Any) -> str:
@@ -157,10 +162,30 @@ class _Csv:
         except pa.ArrowException:
             if not ragged or self.squared:
                 raise
-            self.raw, self.squared = _squared(self.raw[self.at :], self.separator, len(places)), True
+            self.raw, self.squared = self._rows_squared(len(places)), True
             self.at = 0
             return self._read(columns, kind)
         return table.rename_columns(columns)
+
+    def _rows_squared(self, cells: int) -> bytes:
+        try:
+            return _squared(self.raw[self.at :], self.separator, cells)
+        except csv.Error as e:
+            raise LogError(f"{self.path}: rows cannot be read ({e})") from None
+
+    def _closed(self) -> None:
+        """Refuse a quotation mark that nobody closes: it would swallow all rows behind it as one cell."""
+        text, row = self.raw[self.at :].decode() + f"\n{_END}", self.first
+        try:
+            for cells in csv.reader(io.StringIO(text, newline=""), delimiter=self.separator):
+                if cells and cells[-1].endswith(_END) and cells != [_END]:
+                    break
+                row += 1 + sum(c.count("\n") for c in cells)
+            else:
+                return
+        except csv.Error:  # a cell longer than any number
+            pass
+        raise LogError(f"{self.path}: row {row}: a quotation mark opens a cell that no other one closes")
 
     def _numbers(self, header: str) -> np.ndarray:
         """A column whose cells are not all plain numbers: blanks are taken off, the first cell that is none is
@@ -169,7 +194,10 @@ class _Csv:
         import pyarrow as pa
 
         try:
-            text = [cell.strip() for cell in self._read([header], pa.string()).column(header).to_pylist()]
+            if self.text is None:
+                ready = self.ready or {}
+                self.text = self._read([h for h in self.headers if h and h not in ready], pa.string())
+            text = [cell.strip() for cell in self.text.column(header).to_pylist()]
         except (pa.ArrowException, csv.Error) as e:
             raise LogError(f"{self.path}: column {header!r}: {str(e)[:160]}") from None
         values = np.full(len(text), ABSENT)

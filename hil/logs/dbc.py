@@ -23,6 +23,9 @@ _DROP = (("VAL_",), ("CM_",),
          "BO_TX_BU_", "VAL_TABLE_"))  # fmt: skip
 
 
+_STATEMENT = re.compile(r'(?:[^;"]|"(?:[^"\\]|\\.)*+")*+;', re.DOTALL)  # up to its end, from anywhere in it
+
+
 @dataclass(frozen=True)
 class Message:
     """One message of the database, with what the product needs beyond its layout.
@@ -61,8 +64,7 @@ def _load_dbc(path: str, raw: bytes) -> tuple[list[Message], list[str]]:
         tries = [(text, True, ""), (text, False, "")]
         for k in range(1, len(_DROP) + 1):
             gone = [word for words in _DROP[:k] for word in words]
-            shorter = re.sub(rf'^[ \t]*(?:{"|".join(gone)})[ \t](?:[^;"]|"(?:[^"\\]|\\.)*")*;', "", text, flags=re.M)
-            tries.append((shorter, False, "without its lines " + ", ".join(gone)))
+            tries.append((_without(text, gone), False, "without its lines " + ", ".join(gone)))
     reason = ""
     for content, strict, lost in tries:
         try:
@@ -73,6 +75,15 @@ def _load_dbc(path: str, raw: bytes) -> tuple[list[Message], list[str]]:
             continue
         return messages, [f"{path}: read {lost} ({reason})"] if lost else []
     raise LogError(f"{path}: is not a database that cantools reads ({reason})")
+
+
+def _without(text: str, gone: list[str]) -> str:
+    """A database without the statements that begin with some words; what nobody ends with a semicolon stays."""
+    begins, kept, at = re.compile(rf"^[ \t]*+(?:{'|'.join(gone)})[ \t]", re.M), [], 0
+    while (start := begins.search(text, at)) is not None and (end := _STATEMENT.match(text, start.end())) is not None:
+        kept.append(text[at : start.start()])
+        at = end.end()
+    return "".join([*kept, text[at:]])
 
 
 def _message(m: Any) -> Message:

@@ -19,6 +19,7 @@ from vaneloop.base.vanes import VANES
 
 __all__ = [
     "CERTAIN",
+    "LONGEST_NAME",
     "Meaning",
     "bracketed",
     "is_time",
@@ -31,6 +32,7 @@ __all__ = [
 ]
 
 CERTAIN = 0.98  # of a name that says all that there is to say
+LONGEST_NAME = 1_000  # letters; no logger writes more, and what is longer means nothing here
 
 # meaning -> words, English and German, as loggers and signal lists write them
 _WORDS = {
@@ -69,6 +71,7 @@ _CLOCK = frozenset(_WORDS.pop("clock").split())  # what only a time may be calle
 _MEANING = {word: what for what, words in _WORDS.items() for word in words.split()} | dict.fromkeys(
     ("of", "the", "in", "and"), "filler"
 )
+_LONGEST_WORD = max(map(len, _MEANING))
 _ACRONYMS = ("hp", "lp", "nh", "nl", "nr", "ng", "sv", "tm")  # that names write before a word without a gap: NHist
 _PLACE = {"position", "pos", "posn", "stellung"}  # of a stroke, or of a vane
 _VANES = ("vigv", "vgv", "vane", "stage")
@@ -140,28 +143,53 @@ _SIGNALS: dict[str, tuple[str, frozenset[str], frozenset[str], str, float]] = {
 _PATH = re.compile(r"::|\.(?=\D)|/(?=\s*\D)")
 
 
+def _bracket(name: str) -> tuple[str, str] | None:
+    """A name that ends in a bracket: what stands before it, and what in it; None for another."""
+    text = name.rstrip()
+    at = max(text.rfind("["), text.rfind("("))
+    if at < 0 or text[-1] not in "])" or any(c in "])" for c in text[at:-1]):
+        return None
+    return text[:at].rstrip(), text[at + 1 : -1]
+
+
 def _plain(name: str) -> str:
     """The part of a name that says what it is: without the path of the model, the device and the port."""
-    text = re.sub(r"\[\]?\{[^}]*\}|\{[^}]*\}|[\"'<>]", "", name).strip()
+    text = re.sub(r"\[\]?\{[^{}]*\}|\{[^{}]*\}|[\"'<>]", "", name).strip()
     text = re.sub(r":\d+$", "", text.split("\\")[0])  # INCA's device, Simulink's port
-    if bracket := re.fullmatch(r"(.*?)\s*[\[(]([^\[\]()]*)[\])]\s*", text):
-        inside = " ".join(re.findall(r"[a-z]+|\d+", bracket[2].casefold()))
+    if bracket := _bracket(text):
+        before, inside = bracket[0], " ".join(re.findall(r"[a-z]+|\d+", bracket[1].casefold()))
         # a unit stands in the file's own words; (Soll) is part of the name
-        text = bracket[1] if not inside or inside in _UNITS else f"{bracket[1]} {inside}"
+        text = before if not inside or inside in _UNITS else f"{before} {inside}"
     text = _PATH.split(text)[-1] if not re.search(r"(?i)[u1r]/min$", text) else text
     return text.translate(_UMLAUTS)
 
 
 def _compound(word: str) -> list[str] | None:
-    """A word made of words of the dictionary, of three letters or more: solldrehzahl, versorgungsdruck, nhist."""
-    if not word:
-        return []
-    for n in range(len(word), 1, -1):
-        if word[:n] in (_MEANING if n > 2 else _ACRONYMS):
-            for rest in (word[n:], word[n + 1 :] if word[n : n + 1] in ("s", "n") and len(word) > n + 1 else None):
-                if rest is not None and (tail := _compound(rest)) is not None:
-                    return [word[:n], *tail]
-    return None
+    """A word made of words of the dictionary, of three letters or more: solldrehzahl, versorgungsdruck, nhist.
+
+    From its end on, each place where such words can begin gets the longest first word after which the rest is made of
+    words, too; an s or n may join two.
+    """
+    end = len(word)
+    steps = {end: (0, end)}  # place -> letters of the word that begins there, place of the next
+    for at in range(end - 2, -1, -1):
+        for n in range(min(end - at, _LONGEST_WORD), 1, -1):
+            after = at + n
+            if word[at:after] not in (_MEANING if n > 2 else _ACRONYMS):
+                continue
+            joined = after + 1 if word[after : after + 1] in ("s", "n") and end > after + 1 else after
+            following = next((k for k in (after, joined) if k in steps), None)
+            if following is not None:
+                steps[at] = n, following
+                break
+    if 0 not in steps:
+        return None
+    words, at = [], 0
+    while at < end:
+        n, following = steps[at]
+        words.append(word[at : at + n])
+        at = following
+    return words
 
 
 def _parts(chunk: str) -> list[str]:
@@ -212,14 +240,16 @@ def unit_kind(unit: str) -> str:
 
 def bracketed(name: str) -> str:
     """The unit in the bracket at a name's end; "" without one."""
-    m = re.fullmatch(r".*[\[(]([^\[\]()]+)[\])]\s*", name)
-    return m[1].strip() if m and (unit_kind(m[1]) or m[1].strip() == "%") else ""
+    inside = (_bracket(name) or ("", ""))[1]
+    return inside.strip() if unit_kind(inside) or inside.strip() == "%" else ""
 
 
 def unit_behind(name: str) -> tuple[str, str]:
     """A name of anything, and the unit behind it, in a bracket or of two letters and more; "" where there is none."""
-    if unit := bracketed(name):
-        return re.split(r"\s*[\[(][^\[(]*$", name)[0], unit
+    if len(name) > LONGEST_NAME:
+        return name, ""
+    if (bracket := _bracket(name)) and (unit := bracketed(name)):
+        return bracket[0], unit
     text = re.sub(r"(?<=[a-z]{2})(?=[A-Z][A-Za-z])", _CAMEL, _plain(name))
     for count in (2, 1):
         parts = list(re.finditer(r"[A-Za-z]+|\d+|%", text))
@@ -235,6 +265,8 @@ def unit_in_name(name: str, said: str = "") -> tuple[tuple[str, ...], str, str]:
 
     said  the unit that the log states for it: with words that name no quantity it says which is meant
     """
+    if len(name) > LONGEST_NAME:
+        return (), "", ""
     text = _plain(name)
     text = re.sub(r"(?<=[a-z]{2})(?=[A-Z][A-Za-z])", _CAMEL, text)  # PosMm, TimeMs
     raw = re.findall(r"[A-Za-z]+|\d+|%", text)
@@ -323,6 +355,8 @@ def meaning(name: str, signals: tuple[str, ...], unit: str = "") -> Meaning | No
 
     The path before a name counts where the name alone says too little: supply.pressure.
     """
+    if len(name) > LONGEST_NAME:
+        return None
     last = _last(name, signals, unit)
     path = _words(" ".join(_PATH.split(name)[:-1]).translate(_UMLAUTS))
     if last is not None and not set(_ELSEWHERE.split()).isdisjoint(path):

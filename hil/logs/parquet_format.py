@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.logs.source import Channel, LogError, Options, Source, check_file, numbers
+from hil.logs.source import Channel, LogError, Options, Source, check_file, numbers, second
 from hil.logs.table import Table, arrow_table, time_column
 from hil.logs.times import from_dates
 from vaneloop.base.files import whole
@@ -36,7 +36,7 @@ def open_parquet(path: Path, options: Options) -> Source:
         schema = file.schema_arrow
     except damage as e:
         raise LogError(f"{path}: is not a Parquet file ({str(e)[:160]})") from None
-    if again := next((n for k, n in enumerate(schema.names) if n in schema.names[:k]), None):
+    if again := second(schema.names):
         raise LogError(f"{path}: column {again!r} is there more than once")
     most = _MOST_ROWS[0] + _MOST_ROWS[1] * size
     if file.metadata.num_rows > most:

@@ -18,7 +18,7 @@ from vaneloop.base.errors import InputError
 
 __all__ = [
     "ABSENT", "Channel", "LogError", "Options", "Series", "Source", "check_file", "close_names", "find", "is_absent",
-    "names_held", "numbers", "read_bytes",
+    "names_held", "numbers", "read_bytes", "second",
 ]  # fmt: skip
 
 MAX_FILE = 4 << 30  # bytes; a CAN log beyond this is split by every logger
@@ -147,6 +147,12 @@ def find(source: Source, name: str, mapped: bool) -> list[str]:
         if hits:
             return hits
     return []
+
+
+def second(names: Iterable[str]) -> str | None:
+    """The first name that was there before; None where all differ."""
+    seen = set[str]()
+    return next((n for n in names if n in seen or seen.add(n)), None)  # type: ignore[func-returns-value]
 
 
 def close_names(name: str, have: Iterable[str]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -65,8 +64,12 @@ class Table:
 
 def split_unit(header: str) -> tuple[str, str]:
     """`n_r [rpm]` is n_r in rpm; no bracket, no unit."""
-    m = re.fullmatch(r"\s*([^\[\]()]+?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))\s*", header)
-    return (m[1], (m[2] if m[2] is not None else m[3]).strip()) if m else (header.strip(), "")
+    text = header.strip()
+    at = next((k for k, c in enumerate(text) if c in "[]()"), 0)
+    pair = {"[": "[]", "(": "()"}.get(text[at : at + 1], "")
+    if not at or not pair or text[-1] != pair[1] or any(c in pair for c in text[at + 1 : -1]):
+        return text, ""
+    return text[:at].rstrip(), text[at + 1 : -1].strip()
 
 
 class NoTime(LogError):
@@ -91,10 +94,11 @@ def time_column(path: Path, headers: list[str], options: Options) -> Time:
     other words, if guesses are wanted.
     """
     asked = next((name for name, signal in options.mapping.items() if signal == "t"), None)
+    called = [(h, h.strip(), split_unit(h)[0]) for h in headers]
     for fold in (str, str.casefold):
         for name in _TIME_NAMES if asked is None else (fold(asked),):
-            for h in headers:
-                if name in (fold(h), fold(h.strip()), fold(split_unit(h)[0])):
+            for h, *others in called:
+                if name == fold(h) or any(name == fold(o) for o in others):
                     return Time(h)
     if asked is not None:
         raise NoTime(
