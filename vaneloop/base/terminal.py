@@ -2,16 +2,22 @@
 
 Exit codes: 0 good, 1 differs or a limit is exceeded, 2 bad input, 70 a defect of VaneLoop itself.
 Only the standard library is imported here, so that help is quick.
+
+Standard input, output and error may be anything (`standard_streams`): closed, a full disk, a pipe that nobody reads any
+more, a terminal that answers no question (`is_terminal`, `keyboard`).
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import os
+import re
+import select
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, NoReturn
 
 from vaneloop.base.errors import InputError, meant
@@ -20,15 +26,20 @@ from vaneloop.base.files import write
 __all__ = [
     "DEFECT",
     "Parser",
+    "ReaderGone",
     "add_output_options",
     "clean",
     "compiling",
     "defect",
+    "input_of",
+    "is_terminal",
+    "keyboard",
     "pairs",
     "print_table",
     "progress_bar",
     "run",
     "say",
+    "standard_streams",
     "start",
     "write_json",
 ]
@@ -48,8 +59,6 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the complaint in one line, with what was probably meant, and exit 2."""
-        import re
-
         if (choice := re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)$", message)) is not None:
             message += meant(choice[1], [c.strip(" '") for c in choice[2].split(",")])
         elif message.startswith("unrecognized arguments: "):
@@ -134,7 +143,7 @@ def print_table(args: argparse.Namespace, title: str, columns: list[str], rows: 
     console = Console(
         file=sys.stderr if args.json == "-" else sys.stdout,
         soft_wrap=False,
-        width=None if sys.stdout.isatty() else 150,
+        width=None if is_terminal(sys.stdout) else 150,
         markup=False,
     )
     console.print(table)
@@ -172,7 +181,7 @@ def progress_bar(args: argparse.Namespace, text: str) -> Iterator[Callable[..., 
     """Give a function that takes the fraction done, and what is being done where that changes; nothing is drawn when
     quiet or when standard error is no terminal.
     """
-    if args.quiet or not sys.stderr.isatty():
+    if args.quiet or not is_terminal(sys.stderr):
         yield None
         return
     from rich.console import Console
@@ -205,20 +214,155 @@ def run(command: Callable[[], int]) -> int:
     """Call ``command``; turn what users can cause into one line on standard error and an exit code, and so a defect of
     ours (`defect`).
     """
+    with standard_streams():
+        try:
+            try:
+                return command()
+            finally:
+                if sys.stdout is not None:
+                    sys.stdout.flush()  # what could not be written is told of here, and not by Python at its end
+        except KeyboardInterrupt:
+            print("stopped", file=sys.stderr)
+            return 130
+        except ReaderGone:
+            return 0
+        except Exception as e:
+            if not isinstance(e, InputError):
+                print(f"vaneloop: {defect(e)}", file=sys.stderr)
+                return DEFECT
+            print(f"vaneloop: {clean(str(e))}", file=sys.stderr)
+            return 2
+
+
+# ---- standard input, output and error --------------------------------------------------------------------------------
+
+
+class ReaderGone(BrokenPipeError):
+    """Whoever read standard output has gone away: nobody asks for the rest."""
+
+
+class _Output(io.FileIO):
+    """Standard output of a command. What cannot be written is bad input: InputError, once, or ReaderGone, once; what
+    comes after it is dropped.
+    """
+
+    dead = False
+
+    def write(self, data: Any, /) -> int:
+        """Write all of ``data``; a descriptor that another program made non-blocking is waited for."""
+        whole = memoryview(data).cast("B")
+        rest = whole
+        while len(rest) and not self.dead:
+            try:
+                written = super().write(rest)
+            except OSError as e:
+                self.dead = True
+                self.refused(e)
+                break
+            if written is None:
+                select.select([], [self], [])
+            rest = rest[written or 0 :]
+        return len(whole)
+
+    def isatty(self) -> bool:
+        """Whether it is a terminal that can be used as one."""
+        return is_terminal(self)
+
+    def refused(self, e: OSError) -> None:
+        """Raise what it is."""
+        if isinstance(e, BrokenPipeError):
+            raise ReaderGone(*e.args) from None
+        raise InputError(f"standard output: cannot be written ({e.strerror or e})") from None
+
+
+class _Complaints(_Output):
+    """Standard error of a command: what cannot be written has nobody to be told to."""
+
+    def refused(self, e: OSError) -> None:
+        """Go on."""
+
+
+@contextmanager
+def standard_streams() -> Iterator[None]:
+    """Standard input, output and error that never surprise a command: a closed one is the null device, so that no file
+    of ours gets its number. Streams that a program has put in the place of Python's stay as they are.
+    """
+    for fd in range(3):
+        try:
+            os.fstat(fd)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free: this one
+    was = sys.stdin, sys.stdout, sys.stderr
+    if sys.stdin is None:
+        sys.stdin = io.TextIOWrapper(io.BytesIO())
+    if sys.stdout is sys.__stdout__:
+        sys.stdout = _wrapped(_Output, 1, sys.stdout)
+    if sys.stderr is sys.__stderr__:
+        sys.stderr = _wrapped(_Complaints, 2, sys.stderr)
     try:
-        return command()
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        sys.stderr.close()
-        return 0
-    except Exception as e:
-        if not isinstance(e, InputError):
-            print(f"vaneloop: {defect(e)}", file=sys.stderr)
-            return DEFECT
-        print(f"vaneloop: {clean(str(e))}", file=sys.stderr)
-        return 2
+        yield
+    finally:
+        sys.stdin, sys.stdout, sys.stderr = was
+
+
+def _wrapped(kind: type[_Output], fd: int, stream: Any) -> Any:
+    """A text stream on a descriptor, in place of Python's own (None: it was closed at the start)."""
+    raw = kind(os.devnull, "w") if stream is None else kind(fd, "w", closefd=False)
+    # a name of a file may hold what the encoding has not
+    encoding = getattr(stream, "encoding", "utf-8")
+    lines = fd == 2 or raw.isatty()
+    return io.TextIOWrapper(io.BufferedWriter(raw), encoding, errors="backslashreplace", line_buffering=lines)
+
+
+def is_terminal(stream: Any) -> bool:
+    """Whether a stream is a terminal that says how it is set; one that refuses is none."""
+    import termios
+
+    try:
+        termios.tcgetattr(stream.fileno())
+    except (AttributeError, OSError, ValueError, termios.error):
+        return False
+    return True
+
+
+@contextmanager
+def keyboard(stream: Any) -> Iterator[int | None]:
+    """Give the descriptor of a terminal whose keys come at once, or None where ``stream`` is none that controls this
+    process and answers every call. The terminal is as it was afterwards.
+    """
+    import termios
+    import tty
+
+    try:
+        fd = stream.fileno()
+        ours = os.tcgetpgrp(fd) == os.getpgrp()
+        before = termios.tcgetattr(fd)
+        if ours:
+            tty.setcbreak(fd)
+    except (AttributeError, OSError, ValueError, termios.error):
+        ours = False
+    if not ours:
+        yield None
+        return
+    try:
+        yield fd
+    finally:
+        with suppress(OSError, termios.error):  # it may be gone by now
+            termios.tcsetattr(fd, termios.TCSADRAIN, before)
+
+
+def input_of(stream: Any) -> int | None:
+    """Descriptor of a stream that this process may read; None of one that is closed, and of a terminal that is another
+    process group's: a command that was started with ``&`` would be stopped for reading it.
+    """
+    try:
+        fd = int(stream.fileno())
+    except (AttributeError, OSError, ValueError):
+        return None
+    try:
+        return fd if os.tcgetpgrp(fd) in (0, os.getpgrp()) else None
+    except OSError:  # no terminal, or not the one that controls this process: nobody else's turn to read it
+        return fd
 
 
 def defect(e: BaseException) -> str:
@@ -237,8 +381,9 @@ def defect(e: BaseException) -> str:
             "it again (--workers 1, at the command line, needs less memory)"
         )
     lines = "".join(traceback.format_exception(e))
-    place = traceback.extract_tb(e.__traceback__)[-1:]
-    at = f" ({Path(place[0].filename).name}:{place[0].lineno})" if place else ""
+    # of an error in another process, its traceback is the text of the cause
+    place = re.findall(r'^ *File "(.*)", line (\d+)', _there(e) or "".join(traceback.format_tb(e.__traceback__)), re.M)
+    at = f" ({Path(place[-1][0]).name}:{place[-1][1]})" if place else ""
     what = " ".join(f"{type(e).__name__}: {e}".split())[:200]
     where = "VANELOOP_DEBUG=1 prints the traceback"
     if os.environ.get("VANELOOP_DEBUG"):
@@ -254,3 +399,8 @@ def defect(e: BaseException) -> str:
         except OSError:
             pass
     return f"internal error: {what}{at}. This is a defect of VaneLoop, not of your input; {where}"
+
+
+def _there(e: BaseException) -> str:
+    """The traceback of an error that came from another process (multiprocessing, concurrent.futures)."""
+    return str(e.__cause__) if type(e.__cause__).__name__.endswith("RemoteTraceback") else ""

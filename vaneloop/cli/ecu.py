@@ -243,32 +243,17 @@ def _typing(args: argparse.Namespace, typed: Any) -> Iterator[None]:
 
     A terminal that controls no process of ours (under an init, in a container) is read in lines, as a pipe is.
     """
-    if typed is None or sys.stdin is None or sys.stdin.closed:
+    fd = terminal.input_of(sys.stdin) if typed is not None else None
+    if fd is None:
         yield
         return
-    fd = sys.stdin.fileno()
-    try:
-        group = os.tcgetpgrp(fd)
-    except OSError:  # no terminal, or not the one that controls this process: nobody else's turn to read it
-        group = 0
-    ours = group == os.getpgrp()
-    if group and not ours:  # started with &: the terminal is the shell's
+    with terminal.keyboard(sys.stdin) as keys:
+        target, of = (_lines, (args, fd, typed)) if keys is None else (_keys, (keys, typed))
+        threading.Thread(target=target, args=of, daemon=True).start()
         yield
-        return
-    if not ours:
-        threading.Thread(target=_lines, args=(args, fd, typed), daemon=True).start()
-        yield
-        return
-    import termios
-    import tty
 
-    before = termios.tcgetattr(fd)
-    tty.setcbreak(fd)
-    threading.Thread(target=_keys, args=(fd, typed), daemon=True).start()
-    try:
-        yield
-    finally:
-        termios.tcsetattr(fd, termios.TCSADRAIN, before)
+
+_LONGEST = 4096  # bytes of a line
 
 
 def _lines(args: argparse.Namespace, fd: int, typed: Any) -> None:
@@ -279,6 +264,9 @@ def _lines(args: argparse.Namespace, fd: int, typed: Any) -> None:
         except OSError:
             return
         *lines, rest = (rest + data).split(b"\n")
+        if len(rest) > _LONGEST:  # as from /dev/zero, where no line ever ends
+            print(f"vaneloop ecu: standard input: a line of more than {_LONGEST:,} bytes; not read on", file=sys.stderr)
+            return
         if not data:
             lines.append(rest)
         for line in lines:
@@ -295,7 +283,13 @@ def _keys(fd: int, typed: Any) -> None:
     while not typed.quit:
         if not select.select([fd], [], [], 0.2)[0]:
             continue
-        text = os.read(fd, 64).decode(errors="replace")
+        try:
+            data = os.read(fd, 64)
+        except OSError:  # the terminal is gone
+            return
+        if not data:
+            return
+        text = data.decode(errors="replace")
         if text in KEYS and not number:
             typed.line(KEYS[text])
             continue

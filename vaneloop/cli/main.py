@@ -93,6 +93,10 @@ traceback)
 
 def main(argv: list[str]) -> int:
     """Run the command line ``argv`` (without the program's name); return the exit code."""
+    return terminal.run(lambda: _main(argv))
+
+
+def _main(argv: list[str]) -> int:
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(_HELP)
         return 0 if argv else 2

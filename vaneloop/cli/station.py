@@ -148,7 +148,7 @@ class Live:
     """
 
     def __init__(self, args: argparse.Namespace):
-        self.terminal = sys.stderr.isatty()
+        self.terminal = terminal.is_terminal(sys.stderr)
         self.on = not args.quiet and (args.live or self.terminal)
         self._lines: queue.Queue[str | None] = queue.Queue(4)
         self._width = 0
