@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
+import signal
 import subprocess
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -35,7 +38,7 @@ from hil.loop.node import Node
 from hil.native import Program
 from hil.native.call import firmware
 from hil.native.isolation import ControllerFailed, isolated
-from hil.native.program import observables, restore, save
+from hil.native.program import _VIEWS, observables, readable, restore, save
 from tests.conftest import ROOT
 from tests.native_builds import BITWISE, REFERENCE, build, wrong
 from vaneloop.base.errors import InputError
@@ -188,8 +191,8 @@ def same_outcome(reference: str, name: str) -> None:
     ours, theirs = injection.run(name), injection.run(name, calibration=with_program(reference))
     assert (ours.modes, ours.faults, ours.counts) == (theirs.modes, theirs.faults, theirs.counts)
     assert theirs.held, theirs.text()
-    for signal, values in ours.trace.signals.items():
-        np.testing.assert_array_equal(values, theirs.trace.signals[signal], err_msg=f"{name} {signal}")
+    for what, values in ours.trace.signals.items():
+        np.testing.assert_array_equal(values, theirs.trace.signals[what], err_msg=f"{name} {what}")
 
 
 @pytest.mark.slow
@@ -209,8 +212,8 @@ def test_a_changed_table_is_the_same_to_the_bit_while_it_runs(reference: str) ->
     change = injection.Machine(start=2.0, duration=2.0, effect="schedule_error", parameters={"offset": 0.5})
     scenario = injection.Scenario(title="tables change", duration=6.0, inject=[change])
     traces = [injection.run(scenario, calibration=c).trace for c in (load_calibration(), with_program(reference))]
-    for signal, values in traces[0].signals.items():
-        np.testing.assert_array_equal(values, traces[1].signals[signal], err_msg=signal)
+    for what, values in traces[0].signals.items():
+        np.testing.assert_array_equal(values, traces[1].signals[what], err_msg=what)
 
 
 @pytest.mark.slow
@@ -267,7 +270,21 @@ WRONG = {
     "no fault": ("out->faults = 512.0;", "faults (=512) must be a whole number from 0 to 511"),
     "abort": ("abort();", "ended by SIGABRT (it aborted)"),
     "exit": ("exit(0);", "ended with code 0"),
-}
+    "its own limit": (
+        "((vaneloop_scalars *)flashed->scalars)->current_limit = 100.0; out->i_cmd = 5.0;", "ended by SIGSEGV"
+    ),
+    "its own limit by force": (
+        "mprotect((void *)((size_t)flashed->scalars / 4096 * 4096), 4096, PROT_READ | PROT_WRITE);"
+        "((vaneloop_scalars *)flashed->scalars)->current_limit = 100.0; out->i_cmd = 5.0;",
+        "ended by SIGSEGV",
+    ),
+    "before its outputs' page": ("((volatile double *)out)[-600] = 1.0;", "ended by SIGSEGV"),
+    "catches its end": ("signal(SIGABRT, SIG_IGN); out->i_cmd = NAN;", "i_cmd (=nan A) must be a finite number"),
+    "recursion": ("sink = deep(1.0);", "ended by SIGSEGV"),
+    "a copy goes on in its place": ("if (!times++ && fork()) _exit(0);", "ended with code 0"),
+    "its guard": ("if (!times++) kill(getppid(), SIGKILL); for (;;) sink += 1.0;", "ended what watches it"),
+}  # fmt: skip
+DEEP = "static double deep(double x) { volatile double y[99]; y[0] = x; return deep(x + 1.0) + y[0]; }"
 
 
 def in_lockstep(calibration: Calibration, seconds: float = 2.0) -> float:
@@ -278,7 +295,7 @@ def in_lockstep(calibration: Calibration, seconds: float = 2.0) -> float:
 @pytest.mark.parametrize("case", WRONG)
 def test_what_goes_wrong_ends_its_own_process_and_says_how(gcc: str, tmp_path: Path, case: str) -> None:
     fault, said = WRONG[case]
-    calibration = with_program(wrong(gcc, tmp_path, fault))
+    calibration = with_program(wrong(gcc, tmp_path, fault, top=DEEP if case == "recursion" else ""))
     with pytest.raises(ControllerFailed) as failure:
         isolated(lambda: in_lockstep(calibration))
     text = str(failure.value)
@@ -303,6 +320,200 @@ def test_a_crash_while_it_is_switched_on_is_told(gcc: str, tmp_path: Path) -> No
     path = wrong(gcc, tmp_path, init=SEGV)
     with pytest.raises(ControllerFailed, match=r"ended by SIGSEGV .* while it was switched on"):
         isolated(lambda: in_lockstep(with_program(path)))
+
+
+# what it leaves behind; NUMBER notes the number of the process
+NUMBER = (
+    'FILE *f = fopen("%s.new", "w"); fprintf(f, "%%d", getpid()); fclose(f); rename("%s.new", "%s");'
+    "sleep(1000); _exit(0);"
+)
+LEFT = {
+    "a child": "if (!times++ && !fork()) { NUMBER }",
+    "with a session of its own": "if (!times++ && !fork()) { setsid(); NUMBER }",
+    "a daemon": "if (!times++ && !fork()) { if (fork()) _exit(0); setsid(); if (fork()) _exit(0); NUMBER }",
+    "that keeps signals off": (
+        "if (!times++ && !fork()) { sigset_t all; sigfillset(&all); sigprocmask(SIG_BLOCK, &all, 0); setsid(); NUMBER }"
+    ),
+}
+
+
+@pytest.mark.parametrize("crash", ["", SEGV])
+@pytest.mark.parametrize("case", LEFT)
+def test_a_process_that_it_leaves_behind_is_ended_and_not_waited_for(
+    gcc: str, tmp_path: Path, case: str, crash: str
+) -> None:
+    noted = tmp_path / "numbers"
+    fault = LEFT[case].replace("NUMBER", NUMBER % (noted, noted, noted))
+    wait = f'while (access("{noted}", F_OK)) usleep(1000);'  # it is there before the run ends
+    calibration = with_program(wrong(gcc, tmp_path, f"{fault} {wait} {crash}"))
+    if crash:
+        with pytest.raises(ControllerFailed, match="ended by SIGSEGV .* in tick 500"):
+            isolated(lambda: in_lockstep(calibration))
+    else:
+        assert isolated(lambda: in_lockstep(calibration)) == 10.0
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(noted.read_text()), 0)
+
+
+def test_a_copy_of_the_process_does_not_run_the_loop(gcc: str, tmp_path: Path) -> None:
+    """A fork that comes back from the step ends there: what follows the run is done once."""
+    calibration = with_program(wrong(gcc, tmp_path, "if (!times++) fork();"))
+    done = tmp_path / "done"
+
+    def task() -> None:
+        in_lockstep(calibration)
+        with done.open("a") as f:
+            f.write("once")
+
+    isolated(task)
+    assert done.read_text() == "once"
+
+
+CLOSED = {
+    "standard output": "close(1);",
+    "standard error": 'close(2); open("/dev/null", O_WRONLY);',
+    "a file descriptor": "for (int fd = 3; fd < 1024; fd++) close(fd);",
+}
+
+
+@pytest.mark.parametrize("said", CLOSED)
+def test_who_closes_what_is_not_its_own_is_told(
+    gcc: str, tmp_path: Path, said: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = wrong(gcc, tmp_path, CLOSED[said])
+    assert main(["run", "--bus", "lockstep", "--duration", "1", "--controller", path]) == 1
+    assert capfd.readouterr().err == f"vaneloop: --controller {path}: it closed {said}, which is not its own\n"
+
+
+HANGS = {
+    "stopped": ({"fault": "raise(SIGSTOP);"}, r"was stopped for 0\.5 s, in tick 500"),
+    "its guard stopped": (
+        {"fault": "kill(getppid(), SIGSTOP); for (;;) sink += 1.0;"}, r"did not come back within 0\.5 s, in tick 500"
+    ),
+    "a copy beside it": ({"fault": "if (!times++) fork(); for (;;) sink += 1.0;"}, r"within 0\.5 s, in tick 500"),
+    "its end": ({"top": "__attribute__((destructor)) static void end(void) { for (;;) sink += 1.0; }",
+                 "fault": "exit(0);"}, r"within 0\.5 s, in tick 500"),
+    "its beginning": ({"top": "__attribute__((constructor)) static void begin(void) { for (;;) sink += 1.0; }"},
+                      r"within 0\.5 s, in the loading of its library, while it was switched on"),
+    "its black box": (
+        {"fault": 'char line[512]; FILE *maps = fopen("/proc/self/maps", "r"); unsigned long a, b;'
+                  'while (fgets(line, 512, maps)) if (strstr(line, "box-") && sscanf(line, "%lx-%lx", &a, &b))'
+                  "memset((void *)a, 0xff, 4096); for (;;) sink += 1.0;"},
+        r"did not come back within 0\.5 s, as far as is known outside a call of it; memory that",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", HANGS)
+def test_whatever_hangs_is_ended(gcc: str, tmp_path: Path, case: str) -> None:
+    parts, said = HANGS[case]
+    calibration = with_program(wrong(gcc, tmp_path, **parts))
+    with pytest.raises(ControllerFailed, match=said):
+        isolated(lambda: in_lockstep(calibration), patience=0.5)
+
+
+def test_who_does_not_hear_an_interrupt_is_ended(gcc: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hil.native.isolation._ENDING", 0.3)
+    calibration = with_program(wrong(gcc, tmp_path, init="signal(SIGINT, SIG_IGN);"))
+    ready = tmp_path / "ready"
+
+    def task() -> None:
+        in_lockstep(calibration)
+        ready.touch()
+        while True:
+            time.sleep(0.1)
+
+    def interrupt() -> None:
+        while not ready.exists():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(ControllerFailed, match=r"did not end within 0\.3 s of SIGINT"):
+        isolated(task)
+
+
+def test_an_interrupt_ends_the_run_of_a_good_controller(gcc: str, tmp_path: Path) -> None:
+    ready = tmp_path / "ready"
+
+    def task() -> None:
+        ready.touch()
+        while True:
+            time.sleep(0.1)
+
+    def interrupt() -> None:
+        while not ready.exists():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(KeyboardInterrupt):
+        isolated(task)
+
+
+DESCRIBES = {
+    "NULL": ("return NULL;", "vaneloop_describe returned NULL"),
+    "too many": ("d.observables = 2000000000;", "observables (=2000000000 at NULL) must be in [0, 10000]"),
+    "fewer than none": ("d.observables = -1; d.observable = &o;", "observables (=-1) must be in [0, 10000]"),
+    "no value": ("d.observables = 1; d.observable = &o; o.value = NULL;", "observable 0 (='x')"),
+    "no name": ("d.observables = 1; d.observable = &o; o.name = NULL;", "observable 0 (='')"),
+    "nowhere": ("d.observables = 1; d.observable = (void *)16;", "SIGSEGV (it reached memory that is not its own), in "
+                "vaneloop_describe"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", DESCRIBES)
+def test_what_it_says_of_itself_is_checked(
+    gcc: str, tmp_path: Path, case: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    code, said = DESCRIBES[case]
+    top = (
+        'static vaneloop_own_observable o = {"x", "m", "", (const double *)&sink}; static vaneloop_description d;'
+        f"const vaneloop_description *vaneloop_describe(void) {{ {code} return &d; }}"
+    )
+    path = wrong(gcc, tmp_path, top=top)
+    assert main(["run", "--bus", "lockstep", "--duration", "0.1", "--controller", path, "--quiet"]) in (1, 2)
+    line = capfd.readouterr().err.strip()
+    assert said in line and path in line and "\n" not in line
+
+
+def test_a_library_does_not_change_how_this_process_rounds(gcc: str, tmp_path: Path) -> None:
+    """As one does that was built with -ffast-math: it changes the arithmetic of who loads it."""
+    top = "__attribute__((constructor)) static void begin(void) { fesetround(FE_UPWARD); }"
+    path = wrong(gcc, tmp_path, top=top)
+    third = np.float64(1.0) / np.float64(3.0)
+
+    def task() -> bool:
+        foreign = Program(path).start(load_calibration())
+        return bool(foreign) and bool(np.float64(1.0) / np.float64(3.0) == third)
+
+    assert isolated(task)
+
+
+def test_what_was_flashed_while_it_runs_is_seen_and_not_changed_by_it() -> None:
+    """The same numbers twice: the loop's can be written, the controller's follow them."""
+    calibration = load_calibration()
+    cal = readable(calibration)
+    for name in ("k", "table", "angles"):
+        ours = getattr(cal, name)
+        assert (ours == getattr(calibration, name)).all()
+        ours += 1.0
+        seen = np.ctypeslib.as_array(ctypes.cast(_VIEWS[ours.ctypes.data], ctypes.POINTER(ctypes.c_double)), ours.shape)
+        assert (seen == ours).all() and (ours == getattr(calibration, name) + 1.0).all()
+
+
+def test_a_defect_of_ours_beside_a_controller_names_its_place(
+    gcc: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise KeyError("level.square_root")
+
+    monkeypatch.setenv("VANELOOP_DEBUG", "1")
+    monkeypatch.setattr("hil.bus.lockstep_bus.run_lockstep", broken)
+    words = ["run", "--bus", "lockstep", "--duration", "0.1", "--controller", wrong(gcc, tmp_path)]
+    assert main(words) == 70
+    err = capfd.readouterr().err
+    assert "in broken" in err and "internal error: KeyError: 'level.square_root' (test_native.py:" in err
 
 
 def test_a_long_task_without_a_controller_in_a_step_is_not_taken_for_a_hang() -> None:

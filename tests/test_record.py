@@ -234,6 +234,23 @@ def test_what_an_append_needs_is_loaded_before_the_first_frame_comes(suffix: str
     assert done.stdout.strip() == "[]"
 
 
+def test_a_recording_ends_though_another_process_holds_its_pipe(tmp_path: Path) -> None:
+    """A copy of the loop's process, forked by who runs in it, has every descriptor that it had."""
+    recorder = RecorderProcess(tmp_path / "run.log")
+    other = os.fork()
+    if other == 0:
+        signal.pause()
+        os._exit(0)
+    try:
+        recorder.put(some_frames(10).tobytes())
+        recorder.close()
+    finally:
+        os.kill(other, signal.SIGKILL)
+        os.waitpid(other, 0)
+    assert recorder.frames == 10 and not recorder.error
+    assert len(read_record(tmp_path / "run.log").ms) == 10
+
+
 # ---- kill -9 ---------------------------------------------------------------------------------------------------------
 
 

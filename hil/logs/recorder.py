@@ -50,6 +50,7 @@ __all__ = [
 ]  # fmt: skip
 
 FLUSH = 0.5  # s between two appends; at most this much is lost
+_END = b"\xff" * FRAME.itemsize  # in place of a frame: nothing comes after it; who forked may hold the pipe still
 _WHOLE = select.PIPE_BUF // FRAME.itemsize * FRAME.itemsize  # bytes that a pipe takes whole or not at all
 SUFFIXES: dict[str, Callable[[Path, str], RecordFormat]] = {
     ".log": CandumpRecord,
@@ -247,6 +248,9 @@ class RecorderProcess:
         went wrong.
         """
         assert self._process.stdin is not None
+        os.set_blocking(self._pipe, True)
+        with contextlib.suppress(BrokenPipeError):
+            os.write(self._pipe, _END)
         self._process.stdin.close()
         word, _, rest = self._answer().partition(" ")
         self._process.wait()
@@ -264,7 +268,7 @@ def _enlarge(pipe: int, size: int = 1 << 20) -> None:
 
 
 def serve(path: str, channel: str) -> int:
-    """Record what comes through standard input until it ends, and say on standard output how that went."""
+    """Record what comes through standard input until it ends or says so, and say on standard output how that went."""
     import signal
 
     for number in (
@@ -282,16 +286,17 @@ def serve(path: str, channel: str) -> int:
         recorder = Recorder(path, channel)
         say(f"ready {recorder.kept or ''}")
         rest, size = b"", FRAME.itemsize
-        while True:
+        while not rest.endswith(_END):
             if select.select([0], [], [], FLUSH / 2)[0]:
                 data = os.read(0, 1 << 20)
                 if not data:
                     break
                 rest += data
                 whole = len(rest) - len(rest) % size
-                if whole:
-                    recorder.put(rest[:whole])
-                    rest = rest[whole:]
+                frames = rest[:whole].removesuffix(_END)
+                if frames:
+                    recorder.put(frames)
+                rest = rest[len(frames) :]
             recorder.poll()
         recorder.close()
     except InputError as e:

@@ -20,6 +20,7 @@ import numpy as np
 from controller import Calibration, new_inputs, new_outputs, new_state
 from controller.records import SLOW, Record, as_inputs, as_outputs, as_scalars, as_state, state_rows
 from hil.native.call import firmware
+from hil.native.program import readable
 from plant import Plant, chain, curve, places
 from plant.effects import CURVES, can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
 from vaneloop.base.compiled import in_place, inlined
@@ -144,7 +145,10 @@ def new_loop(
 
 def flashed(calibration: Calibration, plant: Plant) -> Calibration:
     """Return the calibration as it is in the controller: with the effects that change its tables and gains."""
-    cal = calibration._replace(k=calibration.k.copy(), table=calibration.table.copy(), program=None)
+    if calibration.program is None:
+        cal = calibration._replace(k=calibration.k.copy(), table=calibration.table.copy())
+    else:
+        cal = readable(calibration)
     _flash(calibration._replace(program=None), cal, np.empty(3), plant.p, plant.p[places.SCHEDULE_ERROR, 0])
     return cal
 

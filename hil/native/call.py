@@ -31,7 +31,9 @@ from controller.records import (
 )
 from vaneloop.base.compiled import in_place
 
-__all__ = ["ENTERED", "OBSERVABLES", "REASON", "REASONS", "RETURNED", "STARTED", "VALUE", "Foreign", "firmware"]
+__all__ = [
+    "CALL", "CALLS", "ENTERED", "OBSERVABLES", "REASON", "REASONS", "RETURNED", "STEP", "VALUE", "Foreign", "firmware",
+]  # fmt: skip
 
 OBSERVABLES = flat_names(OBSERVABLE_FIELDS)
 N_IN, N_OUT, N_SEEN, CANARIES = len(INPUTS), len(OUTPUTS), len(OBSERVABLES), 8
@@ -40,7 +42,13 @@ CANARY = 7.25e77  # before each struct, where a controller that writes below it 
 ROUNDING = 1e-9  # A: a limit of 40 mA in single precision is 0.6 nA more
 
 # numbers of the black box's head, float64
-ENTERED, RETURNED, REASON, VALUE, STARTED, N_HEAD = range(6)
+ENTERED, RETURNED, REASON, VALUE, CALL, N_HEAD = range(6)
+# in which function of the controller's the process is; of a step and what it shows, ENTERED and RETURNED say whether
+CALLS = (
+    "vaneloop_step", "the loading of its library", "vaneloop_version", "vaneloop_init", "vaneloop_describe",
+    "vaneloop_save", "vaneloop_restore", "the unloading of its library",
+)  # fmt: skip
+STEP = 0.0  # in CALLS
 # why a controller was stopped; what it gave is in VALUE
 CURRENT_NAN, CURRENT_LIMIT, DEMAND_NAN, MODE, FAULT, BELOW = range(1, 7)
 REASONS = {
@@ -61,7 +69,7 @@ class Foreign(NamedTuple):
                          each are canaries
     at_fed, at_given, at_seen  their addresses
     box                  float64[N_HEAD] black box: the tick that was begun and ended last (counted from 1), why it
-                         was stopped and what it gave then
+                         was stopped, what it gave then, and in which other call it is
     rows                 float64[n, inputs] inputs of the ticks, tick k in row k % n
     shown                int64[n] numbers of the firmware's state where the observables belong
     """
@@ -123,9 +131,9 @@ def _stopped(a: Foreign, reason: int, value: float) -> None:
 
 
 @in_place
-def _judge(a: Foreign, limit: float) -> None:
-    """Stop a controller whose outputs cannot be, or which wrote outside them."""
-    out = as_outputs(a.given[CANARIES:])
+def _judge(a: Foreign, outputs: np.ndarray, limit: float) -> None:
+    """Stop a controller whose ``outputs`` cannot be, or which wrote outside its own."""
+    out = as_outputs(outputs)
     i, mode, faults = out.i_cmd, out.mode, out.faults
     if not abs(i) < np.inf:
         _stopped(a, CURRENT_NAN, i)
@@ -166,10 +174,10 @@ def foreign_tick(inputs: np.ndarray, outputs: np.ndarray, z: np.ndarray, calibra
             state.n_dem, state.n_r_raw, state.n_r = fed.n_dem, fed.n_r, fed.n_r
         if abs(fed.x_lvdt) < np.inf:
             state.x_meas = fed.x_lvdt
-    _judge(a, as_scalars(calibration.k).current_limit)
-    a.box[RETURNED] = k + 1.0
-    for q in range(N_OUT):
+    for q in range(N_OUT):  # what is judged is ours: a thread of the library's cannot change it any more
         outputs[q] = a.given[CANARIES + q]
+    _judge(a, outputs, as_scalars(calibration.k).current_limit)
+    a.box[RETURNED] = k + 1.0
     out = as_outputs(outputs)
     state.i_cmd, state.x_dem, state.mode, state.faults = out.i_cmd, out.x_dem, out.mode, out.faults
     state.ticks += 1.0

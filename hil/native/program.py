@@ -1,34 +1,40 @@
 """A compiled controller of the user's own: a shared library with the functions of `vaneloop_controller.h`.
 
 Each loop gets a private copy of the file, so that global variables of the library belong to one loop. What it is given
-to write to ends at a wall of memory that nobody may touch: a controller that writes beyond ends itself.
+to write to lies between walls of memory that nobody may touch, and its calibration in memory that it may not write: a
+controller that writes elsewhere ends itself.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import fcntl
 import mmap
 import os
 import platform
 import shutil
 import struct
+import sys
 import tempfile
 import weakref
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from controller import Calibration
 from controller.header import VERSION
 from hil.native import black_box
-from hil.native.call import CANARIES, CANARY, N_IN, N_OUT, N_SEEN, SHOWN, STARTED, Foreign
+from hil.native.black_box import calling
+from hil.native.call import CANARIES, CANARY, N_IN, N_OUT, N_SEEN, SHOWN, Foreign
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import load_toml
 from vaneloop.base.vanes import VANES
 
-__all__ = ["NEEDED", "OPTIONAL", "Program", "observables", "own_scalars", "restore", "save"]
+__all__ = ["NEEDED", "OPTIONAL", "Program", "observables", "own_scalars", "readable", "restore", "save"]
 
 NEEDED = ("vaneloop_version", "vaneloop_init", "vaneloop_step")
 OPTIONAL = ("vaneloop_observe", "vaneloop_save", "vaneloop_restore", "vaneloop_describe")
@@ -42,7 +48,12 @@ _NAMES = {
 }
 _SHARED_OBJECT = 3  # ELF's e_type
 _libc = ctypes.CDLL(None, use_errno=True)
+_F_SEAL_FUTURE_WRITE = 0x10  # Linux 5.1; in Python's fcntl from 3.13
+_MOST = 10_000  # scalars or observables of a controller's own
+_MOST_STATE = 1 << 28  # bytes
 _libc.mprotect.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
+_libm = ctypes.CDLL("libm.so.6" if sys.platform == "linux" else None)
+_FENV = 256  # bytes, more than any machine's fenv_t
 _dlclose = _libc.dlclose
 _dlclose.argtypes = [ctypes.c_void_p]
 _Doubles = ctypes.POINTER(ctypes.c_double)
@@ -94,34 +105,55 @@ class _Description(ctypes.Structure):
     ]
 
 
-def _description(library: ctypes.CDLL) -> _Description:
-    """What the controller says of itself; nothing where it has no vaneloop_describe."""
-    if not hasattr(library, "vaneloop_describe"):
-        return _Description()
-    library.vaneloop_describe.restype = ctypes.POINTER(_Description)
-    return cast("_Description", library.vaneloop_describe()[0])
-
-
 def _given(cal: Calibration) -> _Calibration:
-    """The calibration as C sees it, in the memory of ``cal``."""
-    assert cal.k.flags.c_contiguous and cal.table.flags.c_contiguous and cal.angles.flags.c_contiguous
-    speed, extension, retraction, single = (row.ctypes.data for row in cal.table)
-    stroke, *angles = (row.ctypes.data for row in cal.angles)
-    every = (ctypes.c_void_p * len(VANES))(*angles, *([None] * (len(VANES) - len(angles))))
+    """A calibration (`readable`) as C sees it: in memory that it cannot write."""
+    k, table, angles = (_VIEWS[array.ctypes.data] for array in (cal.k, cal.table, cal.angles))
+    speed, extension, retraction, single = (table + row * cal.table.strides[0] for row in range(4))
+    stroke, *lines = (angles + row * cal.angles.strides[0] for row in range(len(cal.angles)))
+    every = (ctypes.c_void_p * len(VANES))(*lines, *([None] * (len(VANES) - len(lines))))
     points, strokes = cal.table.shape[1], cal.angles.shape[1]
-    return _Calibration(cal.k.ctypes.data, points, speed, extension, retraction, single, strokes, stroke, every)
+    return _Calibration(k, points, speed, extension, retraction, single, strokes, stroke, every)
+
+
+_VIEWS: dict[int, int] = {}  # address of an array of `readable` -> where a controller sees it
+
+
+def readable(calibration: Calibration) -> Calibration:
+    """A copy of a calibration that can be changed here while a controller reads it, and that the controller cannot
+    change: the same memory twice, once for each.
+    """
+    arrays = {name: getattr(calibration, name) for name in ("k", "table", "angles")}
+    handle = os.memfd_create("calibration", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    try:
+        os.ftruncate(handle, sum(a.nbytes for a in arrays.values()))
+        ours = mmap.mmap(handle, 0)
+        with contextlib.suppress(OSError):  # an older kernel has no such seal: mprotect could lift what comes next
+            fcntl.fcntl(handle, fcntl.F_ADD_SEALS, _F_SEAL_FUTURE_WRITE)
+        theirs = mmap.mmap(handle, 0, prot=mmap.PROT_READ)
+    finally:
+        os.close(handle)
+    seen, at, out = np.frombuffer(theirs, np.float64).ctypes.data, 0, {}
+    for name, array in arrays.items():
+        out[name] = np.frombuffer(ours, np.float64, array.size, at).reshape(array.shape)
+        out[name][:] = array
+        _VIEWS[out[name].ctypes.data] = seen + at
+        weakref.finalize(ours, _VIEWS.pop, out[name].ctypes.data, None)
+        at += array.nbytes
+    weakref.finalize(ours, theirs.close).atexit = False
+    return calibration._replace(program=None, **out)
 
 
 def _walled(numbers: int) -> np.ndarray:
     """Memory for canaries and a struct of ``numbers`` doubles, float64[CANARIES + numbers], with a wall right behind
-    it.
+    it, and one before its page.
     """
     page = mmap.PAGESIZE
-    block = mmap.mmap(-1, 2 * page)
+    block = mmap.mmap(-1, 3 * page)
     whole = np.frombuffer(block, np.float64)
-    if _libc.mprotect(whole.ctypes.data + page, page, 0):
-        raise OSError(ctypes.get_errno(), "mprotect")
-    end = page // 8
+    for wall in (0, 2 * page):
+        if _libc.mprotect(whole.ctypes.data + wall, page, 0):
+            raise OSError(ctypes.get_errno(), "mprotect")
+    end = 2 * page // 8
     out = whole[end - numbers - CANARIES : end]
     out[:CANARIES] = CANARY
     return out
@@ -143,42 +175,48 @@ class Program:
         _check_file(self.path)
 
     def start(self, calibration: Calibration) -> Foreign:
-        """Switch on a copy of the controller with a calibration, which it may read as long as it runs.
+        """Switch on a copy of the controller with a calibration, which it may read as long as it runs: of one that is
+        `readable` what it is at the time, of another one what it is now.
 
         Raises InputError for a library with other functions or another interface, and with the controller's own words
         where it refuses the calibration.
         """
         head, rows = black_box.new(self.path, calibration)
-        try:
+        if calibration.k.ctypes.data not in _VIEWS:
+            calibration = readable(calibration)
+        with _arithmetic_kept():
             return self._started(calibration, head, rows)
-        finally:  # what ends the process here leaves the box as it is
-            head[STARTED] = 1.0
 
     def _started(self, calibration: Calibration, head: np.ndarray, rows: np.ndarray) -> Foreign:
-        library = self._copy()
+        with calling(head, "the loading of its library"):
+            library = self._copy()
         for name in NEEDED:
             if not hasattr(library, name):
                 raise InputError(f"{self._named}: {name} is missing; {', '.join(NEEDED)} are needed")
         library.vaneloop_version.restype = ctypes.c_uint32
         fed, given, seen = map(_walled, (N_IN, N_OUT, N_SEEN))
-        weakref.finalize(fed.base, _dlclose, library._handle).atexit = False
-        if (found := library.vaneloop_version()) != VERSION:
+        weakref.finalize(fed.base, _unload, library._handle, head).atexit = False
+        with calling(head, "vaneloop_version"):
+            found = library.vaneloop_version()
+        if found != VERSION:
             raise InputError(
                 f"{self._named}: is compiled for interface {found}; this VaneLoop has interface {VERSION}: compile it "
                 f"again with the header that ships"
             )
-        self._set_own(library)
         told = _given(calibration)
+        running = _Running(self._named, library, told, calibration, head)
+        self._set_own(running)
         library.vaneloop_init.restype = ctypes.c_char_p
         library.vaneloop_init.argtypes = [ctypes.POINTER(_Calibration)]
-        complaint = library.vaneloop_init(ctypes.byref(told))
+        with calling(head, "vaneloop_init"):
+            complaint = library.vaneloop_init(ctypes.byref(told))
         if complaint is not None:
             raise InputError(f"{self._named} refuses the calibration: {_line(complaint)}")
         address = {name: _address(library, name) for name in (*NEEDED, *OPTIONAL)}
         out = Foreign(
             address["vaneloop_step"],
             address["vaneloop_observe"],
-            _address(_libc, "abort"),
+            _address(_libc, "_exit"),  # which the library cannot catch, as it could a signal
             fed,
             given,
             seen,
@@ -189,26 +227,25 @@ class Program:
             rows,
             SHOWN,
         )
-        _KEPT[out.at_fed] = (library, told, calibration)
+        _KEPT[out.at_fed] = running
         weakref.finalize(fed.base, _KEPT.pop, out.at_fed, None)
         return out
 
-    def _set_own(self, library: ctypes.CDLL) -> None:
+    def _set_own(self, running: _Running) -> None:
         """Set the controller's own calibration scalars. Raises InputError with file, scalar, value, what is allowed."""
         if self.own is None:
             return
-        told = _description(library)
-        known = {_text(s.name): s for s in told.scalar[: told.scalars]}
+        known = running.described("scalar")
         for name, section in load_toml(self.own).items():
             if name not in known:
                 allowed = ", ".join(known) or "none; it has no vaneloop_describe"
                 raise InputError(f"{self.own}: {name} is no calibration scalar of {self.path}; allowed: {allowed}")
             s, value, unit = known[name], (section or {}).get("value"), (section or {}).get("unit")
-            if unit != _text(s.unit):
-                raise InputError(f"{self.own}: {name}.unit (={unit!r}) must be {_text(s.unit)!r}")
-            if isinstance(value, bool) or not isinstance(value, int | float) or not s.low <= value <= s.high:
-                raise InputError(f"{self.own}: {name} (={value!r} {unit}) must be in [{s.low:g}, {s.high:g}]")
-            s.value[0] = float(value)
+            if unit != s["unit"]:
+                raise InputError(f"{self.own}: {name}.unit (={unit!r}) must be {s['unit']!r}")
+            if isinstance(value, bool) or not isinstance(value, int | float) or not s["low"] <= value <= s["high"]:
+                raise InputError(f"{self.own}: {name} (={value!r} {unit}) must be in [{s['low']:g}, {s['high']:g}]")
+            s["value"][0] = float(value)
 
     @property
     def _named(self) -> str:
@@ -227,7 +264,51 @@ class Program:
             os.unlink(name)
 
 
-_KEPT: dict[int, tuple[ctypes.CDLL, _Calibration, Calibration]] = {}  # what a running controller reads, by its memory
+class _Running(NamedTuple):
+    """A controller that was switched on.
+
+    named    what messages call it
+    told, calibration  what it may read as long as it runs
+    head     of its black box
+    """
+
+    named: str
+    library: ctypes.CDLL
+    told: _Calibration
+    calibration: Calibration
+    head: np.ndarray
+
+    def described(self, kind: str) -> dict[str, dict[str, Any]]:
+        """What it says of its own quantities of one ``kind`` (scalar, observable): name -> value (float64[1], in its
+        own memory), unit, meaning, and a scalar's low and high. Raises InputError for what cannot be read.
+        """
+        if not hasattr(self.library, "vaneloop_describe"):
+            return {}
+        self.library.vaneloop_describe.restype = ctypes.POINTER(_Description)
+        with calling(self.head, "vaneloop_describe"):  # its pointers may lead anywhere
+            told = self.library.vaneloop_describe()
+            if not told:
+                raise InputError(f"{self.named}: vaneloop_describe returned NULL; a vaneloop_description is needed")
+            count, first = getattr(told[0], f"{kind}s"), getattr(told[0], kind)
+            if not (0 <= count <= _MOST and (first or count == 0)):
+                where = "" if first else " at NULL"
+                raise InputError(f"{self.named}: vaneloop_describe: {kind}s (={count}{where}) must be in [0, {_MOST}]")
+            out: dict[str, dict[str, Any]] = {}
+            for i in range(count):
+                name = _text(first[i].name)
+                if not name or name in out or not first[i].value:
+                    allowed = "a name of its own and a pointer to its value are needed"
+                    raise InputError(f"{self.named}: vaneloop_describe: {kind} {i} (={name!r}): {allowed}")
+                out[name] = {
+                    "value": np.ctypeslib.as_array(first[i].value, (1,)),
+                    "unit": _text(first[i].unit),
+                    "meaning": _text(first[i].meaning),
+                    **({"low": first[i].low, "high": first[i].high} if kind == "scalar" else {}),
+                }
+        return out
+
+
+_KEPT: dict[int, _Running] = {}  # by the address of its inputs
 
 
 def observables(foreign: Any) -> dict[str, dict[str, Any]]:
@@ -236,54 +317,66 @@ def observables(foreign: Any) -> dict[str, dict[str, Any]]:
     """
     if not foreign:
         return {}
-    told = _description(_KEPT[foreign.at_fed][0])
-    return {
-        _text(o.name): {"value": float(o.value[0]), "unit": _text(o.unit), "meaning": _text(o.meaning)}
-        for o in told.observable[: told.observables]
-    }
+    running = _KEPT[foreign.at_fed]
+    told = running.described("observable")
+    with calling(running.head, "vaneloop_describe"):
+        return {name: {**o, "value": float(o["value"][0])} for name, o in told.items()}
 
 
 def own_scalars(foreign: Any) -> dict[str, dict[str, Any]]:
     """Calibration scalars of the controller's own, in its own memory: name -> value (float64[1]), unit, meaning, low,
     high; none of the firmware here.
     """
-    if not foreign:
-        return {}
-    told = _description(_KEPT[foreign.at_fed][0])
-    return {
-        _text(s.name): {
-            "value": np.ctypeslib.as_array(s.value, (1,)),
-            "unit": _text(s.unit),
-            "meaning": _text(s.meaning),
-            "low": float(s.low),
-            "high": float(s.high),
-        }
-        for s in told.scalar[: told.scalars]
-    }
+    return _KEPT[foreign.at_fed].described("scalar") if foreign else {}
 
 
 def save(foreign: Any) -> bytes | None:
     """The whole state of a controller (`Foreign`); None where it has no vaneloop_save and vaneloop_restore, and of the
-    firmware here.
+    firmware here. Raises InputError for a size that cannot be.
     """
     if not foreign:
         return None
-    library = _KEPT[foreign.at_fed][0]
+    running = _KEPT[foreign.at_fed]
+    library = running.library
     if not (hasattr(library, "vaneloop_save") and hasattr(library, "vaneloop_restore")):
         return None
     library.vaneloop_save.restype = ctypes.c_size_t
     library.vaneloop_save.argtypes = [ctypes.c_void_p]
-    room = ctypes.create_string_buffer(library.vaneloop_save(None))
-    library.vaneloop_save(room)
+    with calling(running.head, "vaneloop_save"):
+        size = library.vaneloop_save(None)
+        if size > _MOST_STATE:
+            raise InputError(f"{running.named}: vaneloop_save returned {size:,} bytes; allowed: {_MOST_STATE:,}")
+        room = ctypes.create_string_buffer(size)
+        library.vaneloop_save(room)
     return room.raw
 
 
 def restore(foreign: Foreign, state: bytes | None) -> None:
     """Give the controller a state that `save` took."""
-    library = _KEPT[foreign.at_fed][0]
+    running = _KEPT[foreign.at_fed]
+    library = running.library
     library.vaneloop_restore.argtypes = [ctypes.c_void_p]
     library.vaneloop_restore.restype = None
-    library.vaneloop_restore(state)
+    with calling(running.head, "vaneloop_restore"):
+        library.vaneloop_restore(state)
+
+
+def _unload(handle: int, head: np.ndarray) -> None:
+    with calling(head, "the unloading of its library"):
+        _dlclose(handle)
+
+
+@contextlib.contextmanager
+def _arithmetic_kept() -> Iterator[None]:
+    """Restore rounding and the treatment of the smallest numbers, which a library built with -ffast-math changes for
+    the whole process when it is loaded.
+    """
+    kept = ctypes.create_string_buffer(_FENV)
+    _libm.fegetenv(kept)
+    try:
+        yield
+    finally:
+        _libm.fesetenv(kept)
 
 
 def _address(library: Any, name: str) -> int:

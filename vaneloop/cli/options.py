@@ -225,7 +225,7 @@ def guarded(command: Callable[[argparse.Namespace], int]) -> Callable[[argparse.
         if args.save_crash is not None and not args.save_crash.endswith(".parquet"):
             raise InputError(f"--save-crash {args.save_crash}: must end with .parquet")
         try:
-            return isolated(lambda: terminal.run(lambda: command(args)), args.save_crash)
+            return isolated(lambda: command(args), args.save_crash)
         except ControllerFailed as e:
             print(f"vaneloop: {e}", file=sys.stderr)
             return 1

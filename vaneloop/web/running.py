@@ -122,10 +122,10 @@ class Loop:
 
         task = asyncio.ensure_future(call)
         task.add_done_callback(lambda t: t.cancelled() or t.exception())  # the page may be gone: nobody asks for it
-        seen: tuple[float, ...] = ()
+        seen = b""
         since, hung = time.monotonic(), False
         while not (await asyncio.wait([task], timeout=0.5))[0]:
-            now = black_box.progress(self.boxes) if self.boxes is not None else ()
+            now = black_box.progress(self.boxes) if self.boxes is not None else b""
             if now != seen or not now:
                 seen, since = now, time.monotonic()
             elif time.monotonic() - since > PATIENCE:
