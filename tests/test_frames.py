@@ -31,7 +31,9 @@ NONE = np.zeros((0, 2), np.int64)
 
 @pytest.fixture(scope="module")
 def db() -> Any:
-    return cantools.database.load_file(tables.path("vgv.dbc"))
+    """The frames that carry signals."""
+    whole = cantools.database.load_file(tables.path("vgv.dbc"))
+    return cantools.database.Database([m for m in whole.messages if m.frame_id in frames.NAMES])
 
 
 def data_of(payload: int) -> bytes:
@@ -112,6 +114,22 @@ def test_every_frame_and_signal_of_the_dbc_is_known(db: Any) -> None:
         names = {s.name for s in m.signals if s.name not in ("crc", "counter") and not s.name.startswith("fault_")}
         assert names == set(frames.FRAMES[m.frame_id][1]) - {"faults"}
         assert m.dbc.attributes["DataID"].value == 0x5600 + m.frame_id
+
+
+@given(st.binary(min_size=8, max_size=8))
+@example(bytes(8))
+@example(b"\xff" * 8)
+def test_authentication_frames_of_the_dbc_are_those_of_the_code(data: bytes) -> None:
+    whole = cantools.database.load_file(tables.path("vgv.dbc"))
+    auth = {m.frame_id: m for m in whole.messages if m.frame_id not in frames.NAMES}
+    assert {ident: m.name for ident, m in auth.items()} == frames.AUTH_NAMES
+    word = int.from_bytes(data, "little", signed=True)
+    assert data_of(frames.encode_auth(*frames.decode_auth(word))) == data
+    for ident, m in auth.items():
+        of = whole.get_message_by_frame_id(m.dbc.attributes["AuthenticatorOf"].value)
+        assert (m.name, m.cycle_time, ident) == (f"{of.name}_AUTH", of.cycle_time, of.frame_id + frames.AUTH)
+        assert m.dbc.attributes["SecOCDataID"].value == of.dbc.attributes["DataID"].value
+        assert m.decode(data) == frames.decode(int(frames.word0(ident)), word)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300, -1e300, 5e-324])

@@ -164,7 +164,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "override": {**FRAME, "e2e": "right"},
     "send": {
         **ALWAYS, "signals": None, "e2e": None, "counter": 0, "period": None, "length": None, "extended": False,
-        "remote": False,
+        "remote": False, "secoc": "none",
     },
     "flood": {**ALWAYS, "frame": 0x7FF, "last": None, "rate": None},
     "babble": ALWAYS,
@@ -714,7 +714,8 @@ def test_a_claim_has_two_ms_from_power_on_and_is_of_every_bus_by_default() -> No
 def test_a_scenario_is_an_ecu_at_80_percent_by_default() -> None:
     made = Scenario(title="four", duration=1.0)
     assert made.model_dump() == {
-        "title": "four", "why": "", "duration": 1.0, "seed": 1, "demand": [[0.0, 80.0]], "inject": [], "expect": [],
+        "title": "four", "why": "", "duration": 1.0, "seed": 1, "demand": [[0.0, 80.0]], "secoc": False, "inject": [],
+        "expect": [],
     }  # fmt: skip
 
 
@@ -1308,7 +1309,7 @@ def test_without_an_action_it_is_the_run_of_both_nodes_on_the_wire() -> None:
     assert {k: v[-1] for k, v in of.signals.items()} == pytest.approx(last, rel=1e-12)
     assert outcome.counts == {
         **{k: vgv.counts[k] for k in ("good", "sync", "wrong_crc", "repeated", "wrong_sequence", "wrong_length")},
-        "wrong_kind": 0, "lost": 0, "refused": 0,
+        "wrong_kind": 0, "lost": 0, "refused": 0, "unauthentic": 0,
     }  # fmt: skip
     assert (outcome.counts["good"], outcome.counts["sync"]) == (39, 1)
     assert np.array_equal(of.t, np.arange(400) * 1e-3) and (outcome.bus, outcome.simulated_s) == ("lockstep", 0.4)

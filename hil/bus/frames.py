@@ -30,18 +30,17 @@ if TYPE_CHECKING:
     import can
 
 __all__ = [
-    "ANGLES", "COUNTS", "ECU_DEMAND", "ERROR", "EXTENDED", "FD", "FRAMES", "NAMES", "PAUSE", "PREPARED", "REMOTE",
-    "VGV_ANGLES", "VGV_ANGLES_2", "VGV_ANGLES_3", "VGV_HEALTH",
-    "VGV_SERVO",
-    "VGV_STATUS",
-    "decode", "from_bytes", "from_message", "new_receiver", "receive", "refused", "stand_still", "to_bytes",
-    "to_message", "with_demand", "word0",
+    "ANGLES", "AUTH", "AUTH_NAMES", "COUNTS", "ECU_DEMAND", "ERROR", "EXTENDED", "FD", "FRAMES", "FRESHNESS", "NAMES",
+    "PAUSE", "PREPARED", "REMOTE", "UNAUTHENTIC", "VGV_ANGLES", "VGV_ANGLES_2", "VGV_ANGLES_3", "VGV_HEALTH",
+    "VGV_SERVO", "VGV_STATUS", "decode", "decode_auth", "encode_auth", "from_bytes", "from_message", "new_receiver",
+    "receive", "refused", "stand_still", "to_bytes", "to_message", "with_demand", "word0",
 ]  # fmt: skip
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
 HEAD_MASK = 0x04FFFFFFFFFF  # what of word 0 has a meaning
 FD = 1 << 42  # bit 2 of the flags byte, CANFD_FDF
 NOTE = 1 << 56  # no frame: the loop's own word to its node. No bus gives it: it is outside `HEAD_MASK`
+UNAUTHENTIC = 1 << 57  # a frame that its MAC does not prove (`hil.bus.secoc`); no bus gives it either
 IDENT_MASK = (1 << 29) - 1
 LENGTH = 8  # bytes of data of every frame here
 CLASSIC = LENGTH << 32  # word 0 without its identifier
@@ -57,6 +56,8 @@ ANGLES = {  # identifier -> the stages whose angles it carries; sent by a machin
     ident: VANES[IN_FRAME * q : IN_FRAME * (q + 1)] for q, ident in enumerate((VGV_ANGLES, VGV_ANGLES_2, VGV_ANGLES_3))
 }
 DATA_ID = 0x5600  # plus the identifier
+AUTH = 8  # what the identifier of a frame's authentication frame (freshness and MAC, `hil.bus.secoc`) is greater by
+AUTH_NAMES = {ident + AUTH: f"{name}_AUTH" for ident, name in NAMES.items()}
 
 _CRC = crc_table().astype(np.int64)
 _CRC.setflags(write=False)
@@ -67,6 +68,8 @@ _CRC.setflags(write=False)
 PAUSE = NOTE | EXTENDED | CLASSIC | 0x1FFFFF50
 # "work for a tool is done, and takes effect before this tick" (`hil.calibrate.prepare`): word 1 is its number
 PREPARED = NOTE | EXTENDED | CLASSIC | 0x1FFFFF51
+# "the freshness value of this tick" (`hil.loop.secured`): word 1 is the value
+FRESHNESS = NOTE | EXTENDED | CLASSIC | 0x1FFFFF52
 
 
 # ---- bits ------------------------------------------------------------------------------------------------------------
@@ -207,14 +210,30 @@ def decode_health(data: int) -> tuple[float, float, int, int]:
     return u16(data, 16) * 0.001, s16(data, 32) * 0.01, (data >> 48) & 0xFF, (data >> 56) & 0xFF
 
 
+@in_place
+def encode_auth(freshness: int, mac: int) -> int:
+    """Return word 1 of an authentication frame: the low 32 bits of the freshness value, and the MAC's first 32 bits
+    as a number whose lowest byte is the MAC's first.
+    """
+    return (freshness & 0xFFFFFFFF) | ((mac & 0xFFFFFFFF ^ 0x80000000) - 0x80000000) << 32
+
+
+@in_place
+def decode_auth(data: int) -> tuple[int, int]:
+    """Return the low 32 bits of the freshness value, and the MAC, of word 1 of an authentication frame."""
+    return data & 0xFFFFFFFF, (data >> 32) & 0xFFFFFFFF
+
+
 # ---- receiver --------------------------------------------------------------------------------------------------------
 
 MAX_DELTA = 5  # steps of the counter that are taken for loss; more within the time limit is a wrong sequence
 MISSED = 5  # periods without a good frame: stale. The firmware's demand_timeout of 50 ms is the same for ECU_DEMAND.
 
 # verdicts on a frame
-GOOD, SYNC, WRONG_CRC, REPEATED, WRONG_SEQUENCE, WRONG_LENGTH, WRONG_KIND, OTHER = range(8)
-VERDICTS = ("good", "sync", "wrong_crc", "repeated", "wrong_sequence", "wrong_length", "wrong_kind", "other")
+GOOD, SYNC, WRONG_CRC, REPEATED, WRONG_SEQUENCE, WRONG_LENGTH, WRONG_KIND, OTHER, NOT_AUTHENTIC = range(9)
+VERDICTS = (
+    "good", "sync", "wrong_crc", "repeated", "wrong_sequence", "wrong_length", "wrong_kind", "other", "unauthentic",
+)  # fmt: skip
 
 # a receiver: int64[N_RECEIVER]; the first seven count verdicts
 COUNTS = ("good", "sync", "wrong_crc", "repeated", "wrong_sequence", "wrong_length", "wrong_kind", "lost", "stale")
@@ -235,8 +254,9 @@ COUNTS = ("good", "sync", "wrong_crc", "repeated", "wrong_sequence", "wrong_leng
     R_CANDIDATE_TICK,
     R_SILENT,  # periods of the present silence; 0 = not stale
     R_PERIOD,  # ticks
+    R_UNAUTHENTIC,  # without a MAC that proves them; always 0 where frames are not authenticated
     N_RECEIVER,
-) = range(17)
+) = range(18)
 
 
 def new_receiver(ident: int) -> np.ndarray:
@@ -258,7 +278,10 @@ def receive(r: np.ndarray, head: int, data: int, now: int) -> int:
     """
     if head & ERROR or head & IDENT_MASK != r[R_IDENT]:
         return OTHER
-    if head & (EXTENDED | REMOTE | FD):
+    if head & (EXTENDED | REMOTE | FD | UNAUTHENTIC):
+        if head & UNAUTHENTIC:
+            r[R_UNAUTHENTIC] += 1
+            return NOT_AUTHENTIC
         r[R_WRONG_KIND] += 1
         return WRONG_KIND
     if (head >> 32) & 0xFF != LENGTH:
@@ -324,7 +347,8 @@ def stand_still(r: np.ndarray) -> None:
 @in_place
 def refused(r: np.ndarray) -> int:
     """Return how many frames were refused since start."""
-    return r[R_WRONG_CRC] + r[R_REPEATED] + r[R_WRONG_SEQUENCE] + r[R_WRONG_LENGTH] + r[R_WRONG_KIND]
+    bad = r[R_WRONG_CRC] + r[R_REPEATED] + r[R_WRONG_SEQUENCE] + r[R_WRONG_LENGTH] + r[R_WRONG_KIND]
+    return bad + r[R_UNAUTHENTIC]
 
 
 def with_demand(rows: np.ndarray, of: Callable[[float, float, int], tuple[float, float, int] | None]) -> np.ndarray:
@@ -350,6 +374,7 @@ FRAMES: dict[int, tuple[Any, tuple[str, ...]]] = {
     VGV_SERVO: (decode_servo, ("i_cmd", "faults")),
     VGV_HEALTH: (decode_health, ("p_s", "t_oil", "frames_lost", "frames_rejected")),
     **{ident: (decode_angles, vanes) for ident, vanes in ANGLES.items()},
+    **dict.fromkeys(AUTH_NAMES, (decode_auth, ("freshness", "mac"))),
 }
 
 

@@ -49,7 +49,7 @@ Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]  # strict: ne
 Seconds = Annotated[Number, Field(ge=0.0)]
 Positive = Annotated[Number, Field(gt=0.0)]
 Share = Annotated[Number, Field(gt=0.0, le=1.0)]
-IDENTIFIERS = {name: ident for ident, name in frames.NAMES.items()}
+IDENTIFIERS = {name: ident for ident, name in (frames.NAMES | frames.AUTH_NAMES).items()}
 
 
 @lru_cache(maxsize=1)
@@ -221,6 +221,8 @@ class Send(Outsider):
     e2e      right, wrong_crc, wrong_counter (it never counts on), none (CRC and counter as the bytes have them)
     counter  of the first frame
     length   bytes sent, default all of ``data``, 8 with ``signals``
+    secoc    of the authentication frame behind it: none, right (who sends has the key), stale (the same, but the
+             freshness value of a second ago), wrong_mac (a random one), wrong_key
     """
 
     action: Literal["send"] = "send"
@@ -233,6 +235,7 @@ class Send(Outsider):
     length: Annotated[int, Field(ge=0, le=8)] | None = None
     extended: bool = False
     remote: bool = False
+    secoc: Literal["none", "right", "stale", "wrong_mac", "wrong_key"] = "none"
 
     @model_validator(mode="after")
     def _contents(self) -> Send:
@@ -248,14 +251,19 @@ class Send(Outsider):
                 raise ValueError(f"data (={self.data!r}) has {len(raw)} bytes; a classic CAN frame holds at most 8")
         for name, value in (self.signals or {}).items():
             raw_signal(self.frame, name, value)
-        if self.protection != "none" and identifier(self.frame, self.extended) not in IDENTIFIERS.values():
-            raise ValueError(f"e2e (={self.e2e!r}) needs a frame with a DataID in vgv.dbc: {', '.join(IDENTIFIERS)}")
+        known = identifier(self.frame, self.extended) in frames.NAMES
+        protected = ", ".join(frames.NAMES.values())
+        if self.protection != "none" and not known:
+            raise ValueError(f"e2e (={self.e2e!r}) needs a frame with a DataID in vgv.dbc: {protected}")
+        if self.secoc != "none" and not known:
+            raise ValueError(f"secoc (={self.secoc!r}) needs a frame that is authenticated: {protected}")
         return self
 
     @property
     def protection(self) -> str:
         """``e2e``, by default right with signals and none with raw data."""
-        return self.e2e or ("right" if self.signals is not None else "none")
+        signals = self.signals is not None and identifier(self.frame) not in frames.AUTH_NAMES
+        return self.e2e or ("right" if signals else "none")
 
 
 class Flood(Outsider):

@@ -28,6 +28,7 @@ import numpy as np
 
 from controller import MODES
 from hil.bus import frames
+from hil.bus.secoc import Authenticator
 from hil.inject.actions import (
     ACTIONS,
     Action,
@@ -56,6 +57,7 @@ from hil.inject.tamper import Gateway, Intruder, tick_of
 from hil.inject.verdict import TRANSITIONS, Check, Outcome, Trace, failed, judge, outcome_of
 from hil.native.isolation import ControllerFailed, isolated
 from vaneloop.base.errors import InputError
+from vaneloop.base.extras import is_there
 from vaneloop.base.vanes import VANES
 
 if TYPE_CHECKING:
@@ -159,13 +161,11 @@ class Disturber:
         return times + -(-idle // w.RECESSIVE)
 
 
-def sender_of(action: Action) -> str:
+def sender_of(action: OnFrame) -> str:
     """Return the node whose frames the action works on."""
-    return next(
-        who
-        for who, names in SENDER.items()
-        if isinstance(action, OnFrame) and frames.NAMES[identifier(action.frame)] in names
-    )
+    ident = identifier(action.frame)
+    name = frames.NAMES.get(ident) or frames.NAMES[ident - frames.AUTH]
+    return next(who for who, names in SENDER.items() if name in names)
 
 
 def _sent_by(frame: str, plant: Plant) -> bool:
@@ -184,6 +184,24 @@ def _check_stages(name: str, scenario: Scenario, plant: Plant) -> None:
             )
 
 
+def _keys(scenario: Scenario) -> tuple[Authenticator, Authenticator] | None:
+    """What makes MACs under the scenario's key, and under another; None where frames are not authenticated."""
+    if not scenario.secoc:
+        return None
+    chance = random.Random(f"{scenario.seed} keys")
+    return Authenticator(chance.randbytes(16)), Authenticator(chance.randbytes(16))
+
+
+def _secured(node: Node, ecu: Ecu, authenticator: Authenticator) -> tuple[Any, Any]:
+    """Both nodes with authentication; the freshness value of a tick is its number."""
+    from hil.loop.secured import DEMANDED, FROM_CONTROLLER, Secured
+
+    both = Secured(node, authenticator, DEMANDED), Secured(ecu, authenticator, FROM_CONTROLLER)
+    for one in both:
+        one.gate.correct(0, 0)
+    return both
+
+
 def _lockstep(
     name: str,
     scenario: Scenario,
@@ -198,11 +216,11 @@ def _lockstep(
     from hil.loop.node import Ecu, Node
     from plant import build_plant, places
 
-    if plant is not None and (why := lacks(scenario, plant)):
+    plant = plant or build_plant()
+    if why := lacks(scenario, plant):
         raise InputError(f"{name}: {why}")
     started = time.perf_counter()
     points = np.array(scenario.demand)
-    plant = plant or build_plant()
     _check_stages(name, scenario, plant)
     node = Node(plant, calibration, n_r=float(points[0, 1]), seed=scenario.seed)
     ecu = Ecu(plant, n_dem=float(points[0, 1]), seed=scenario.seed + 1)
@@ -215,7 +233,9 @@ def _lockstep(
     ]
     recorded: list[tuple[int, int, int]] = []
     keep = any(isinstance(a, Replay) and a.begin is not None for a in scenario.inject)
-    intruders = [Intruder(a, c, recorded) for a, c in zip(of[Outsider], chance[2:], strict=True)]
+    keys = _keys(scenario)
+    vgv, demanding = (node, ecu) if keys is None else _secured(node, ecu, keys[0])
+    intruders = [Intruder(a, c, recorded, keys) for a, c in zip(of[Outsider], chance[2:], strict=True)]
     machines = [MachineChange(a, node, ecu) for a in of[Machine]]  # type: ignore[arg-type]
     channel = Channel(seed=scenario.seed)
     wire, join = channel.wire, channel.join
@@ -238,12 +258,12 @@ def _lockstep(
         for m in machines:
             m.tick(k)
         disturber.tick(k)
-        from_ecu = ecu.tick(rows, take(wire, stations["ECU"], rows)).tolist()
-        from_vgv = node.tick(rows, take(wire, stations["VGV"], rows)).tolist()
+        from_ecu = demanding.tick(rows, take(wire, stations["ECU"], rows)).tolist()
+        from_vgv = vgv.tick(rows, take(wire, stations["VGV"], rows)).tolist()
         mode[k], faults[k] = z.mode, z.faults
         values[k] = (z.x_dem, z.x_meas, z.i_cmd, z.n_dem, z.n_r_raw, *s[places.POT : places.POT + stages, 0])
         counts[k, :8] = receiver[:8]
-        counts[k, 8] = frames.refused(receiver)
+        counts[k, 8], counts[k, 9] = frames.refused(receiver), receiver[frames.R_UNAUTHENTIC]
         if k % 10 == 0:
             missed = ecu.stale()
             late[k : k + 10] = [n in missed for n in heard]
@@ -334,14 +354,20 @@ LISTEN = 5.0  # s in which the controller must be heard in RUN
 
 def cannot(scenario: Scenario) -> str:
     """Return why an outsider cannot do what the scenario asks for; empty if it can."""
+    if scenario.secoc:
+        return "authentication under a key of the scenario's own; --bus lockstep has it"
     inside = sorted({a.action for a in scenario.inject if not isinstance(a, Outsider)})
     return f"{', '.join(inside)}: no other station on a bus can do that; --bus lockstep can" if inside else ""
 
 
 def lacks(scenario: Scenario, plant: Plant) -> str:
-    """Return what the scenario does to an actuator that this machine does not have; empty if there is no such thing."""
+    """Return what the scenario does to an actuator that this machine does not have, or with a package that is not
+    installed; empty if there is no such thing.
+    """
     from plant.effects import EFFECTS
 
+    if scenario.secoc and not is_there("cryptography"):
+        return "secoc: authentication needs cryptography, which is not installed: pip install 'vaneloop[secoc]'"
     for a in scenario.inject:
         if isinstance(a, Machine):
             if a.p_s is not None and plant.kind != "hydraulic":

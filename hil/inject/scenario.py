@@ -14,7 +14,8 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from controller import FAULTS, MODES
-from hil.inject.actions import IDENTIFIERS, AnyAction, Number, Positive, Replay, Seconds
+from hil.bus.frames import NAMES
+from hil.inject.actions import AnyAction, Number, Positive, Replay, Seconds, Send
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Table, read
 from vaneloop.base.vanes import VANES
@@ -24,7 +25,10 @@ __all__ = ["COUNTS", "SIGNALS", "Expect", "Scenario", "library", "load_scenario"
 # what an expectation can be about, besides mode and faults: signals of the controller in border units, and what its
 # receiver counts
 SIGNALS = ("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", *VANES)
-COUNTS = ("good", "sync", "wrong_crc", "repeated", "wrong_sequence", "wrong_length", "wrong_kind", "lost", "refused")
+COUNTS = (
+    "good", "sync", "wrong_crc", "repeated", "wrong_sequence", "wrong_length", "wrong_kind", "lost", "refused",
+    "unauthentic",
+)  # fmt: skip
 
 
 # ---- expectations ----------------------------------------------------------------------------------------------------
@@ -75,7 +79,7 @@ class Expect(Table):
             "fault": (*FAULTS, "any"),
             "signal": SIGNALS,
             "count": COUNTS,
-            "late": tuple(n for n in IDENTIFIERS if n != "ECU_DEMAND"),
+            "late": tuple(n for n in NAMES.values() if n != "ECU_DEMAND"),
         }
         given = [k for k in kinds if getattr(self, k) is not None]
         if len(given) != 1:
@@ -140,6 +144,7 @@ class Scenario(Table):
     duration   s
     seed       of everything random in it, sensors' noise too
     demand     the ECU's profile: [time (s), n_dem (%)] points, straight lines between them
+    secoc      controller and ECU authenticate their frames (docs/bus.md), under a key that ``seed`` gives
     inject     actions, in the order in which they act on a frame
     expect     claims; besides them, safe limits and documented mode changes are always demanded
     """
@@ -151,6 +156,7 @@ class Scenario(Table):
     demand: Annotated[list[Annotated[list[Number], Field(min_length=2, max_length=2)]], Field(min_length=1)] = [
         [0.0, 80.0]
     ]
+    secoc: bool = False
     inject: list[AnyAction] = []
     expect: list[Expect] = []
 
@@ -167,6 +173,8 @@ class Scenario(Table):
                 raise ValueError(
                     f"inject.{i}.start (={action.start:g} s) must be before the end (duration = {self.duration:g} s)"
                 )
+            if isinstance(action, Send) and action.secoc != "none" and not self.secoc:
+                raise ValueError(f"inject.{i}.secoc (={action.secoc!r}) needs secoc = true in the scenario")
         for i, claim in enumerate(self.expect):
             if claim.latest > self.duration:
                 raise ValueError(f"expect.{i} speaks of {claim.latest:g} s; the scenario ends at {self.duration:g} s")

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from hil.bus import frames
+from hil.bus.secoc import Authenticator
 from hil.inject.actions import (
     Action,
     Babble,
@@ -148,20 +149,37 @@ class Gateway:
 
 
 def _protected(ident: int, data: int, e2e: str) -> int:
-    """Return ``data`` with a CRC that fits the counter in it, unless ``e2e`` keeps the old one."""
-    return data if e2e == "keep" else int(frames.protect(ident, _signed(data), (data >> 8) & 15))
+    """Return ``data`` with a CRC that fits the counter in it, unless ``e2e`` keeps the old one; authentication frames
+    have none.
+    """
+    return (
+        data
+        if e2e == "keep" or ident not in frames.NAMES
+        else int(frames.protect(ident, _signed(data), (data >> 8) & 15))
+    )
 
 
 # ---- what a third station sends --------------------------------------------------------------------------------------
 
+STALE = 1000  # ms by which a stale freshness value is old
 AHEAD = 12  # frames that a flood without a rate keeps waiting: the bus takes at most 11 a millisecond
 
 
 class Intruder:
-    """The frames that one outsider's action sends, tick by tick (1 ms)."""
+    """The frames that one outsider's action sends, tick by tick (1 ms).
 
-    def __init__(self, action: Action, chance: random.Random, recorded: list[tuple[int, int, int]]):
-        self.action, self.chance, self.recorded = action, chance, recorded
+    recorded  what was on the bus: tick and both words
+    keys      what makes MACs under the key in use, and under another; None where frames are not authenticated
+    """
+
+    def __init__(
+        self,
+        action: Action,
+        chance: random.Random,
+        recorded: list[tuple[int, int, int]],
+        keys: tuple[Authenticator, Authenticator] | None = None,
+    ):
+        self.action, self.chance, self.recorded, self.keys = action, chance, recorded, keys
         self.first, self.end = tick_of(action.start), tick_of(action.end)
         self.sent = 0
         self.counter = action.counter if isinstance(action, Send) else 0
@@ -180,7 +198,8 @@ class Intruder:
                 period = round(action.period * 1000.0) if action.period is not None else 0
                 if since and (not period or since % period):
                     return []
-                return [self._frame(action)]
+                frame = self._frame(action)
+                return [frame] if action.secoc == "none" else [frame, self._authentication(action, frame, k)]
             case Flood() as action:
                 low = identifier(action.frame)
                 return self._burst(
@@ -220,6 +239,17 @@ class Intruder:
             ident | length << 32 | (frames.EXTENDED if action.extended else 0) | (frames.REMOTE if action.remote else 0)
         )
         return head, 0 if action.remote else _signed(data & ((1 << 8 * length) - 1))
+
+    def _authentication(self, action: Send, frame: Words, k: int) -> Words:
+        """Return the authentication frame behind a frame of tick ``k``, whose freshness value is the tick's number."""
+        assert self.keys is not None
+        right, wrong = self.keys
+        key = wrong if action.secoc == "wrong_key" else right
+        freshness = max(k - STALE, 0) if action.secoc == "stale" else k
+        head, data = key.frame(identifier(action.frame), frame[1], freshness)
+        if action.secoc == "wrong_mac":
+            data = int(frames.encode_auth(freshness, self.chance.getrandbits(32)))
+        return head, data
 
     def _burst(self, low: int, high: int, rate: float | None, since: int, waiting: int) -> list[Words]:
         n = max(AHEAD - waiting, 0)

@@ -58,7 +58,10 @@ class ParquetRecord:
 
         from vaneloop.base.signals import UNITS
 
-        self.path, self.messages = path, load_dbc(table_path("vgv.dbc"))[0]
+        self.path = path
+        self.messages = [
+            m for m in load_dbc(table_path("vgv.dbc"))[0] if any(s.name in UNITS for s in m.layout.signals)
+        ]
         self.signals = [s.name for m in self.messages for s in m.layout.signals if s.name in UNITS]
         self.schema = pa.schema([
             ("t", pa.float64()), ("time", pa.timestamp("ns", "UTC")), ("id", pa.uint32()), ("extended", pa.bool_()),

@@ -268,6 +268,7 @@ class Node:
         out = {name: int(v) for name, v in zip(frames.COUNTS, self.arrays.receiver, strict=False)}
         for name, at in (("other", C_OTHER), ("own_identifier", C_OURS), ("error_frames", C_ERROR_FRAMES)):
             out[name] = int(self.arrays.counter[at])
+        out["unauthentic"] = int(self.arrays.receiver[frames.R_UNAUTHENTIC])
         return out
 
     def fingerprint(self) -> str:
@@ -275,7 +276,8 @@ class Node:
         digest = hashlib.sha256()
         a, loop = self.arrays, self.loop
         counters = a.counter[: C_ANGLES_2 + (len(loop.angles) - 1) // IN_FRAME]
-        for part in (loop.z[loop.z_rows], loop.s[loop.s_rows], loop.mean, a.receiver, counters):
+        receiver = a.receiver if a.receiver[frames.R_UNAUTHENTIC] else a.receiver[: frames.R_UNAUTHENTIC]
+        for part in (loop.z[loop.z_rows], loop.s[loop.s_rows], loop.mean, receiver, counters):
             digest.update(part.tobytes())
         return digest.hexdigest()
 

@@ -40,7 +40,9 @@ import numpy as np
 
 from hil.bus.frames import HEAD_MASK, NOTE, PAUSE
 
-__all__ = ["POLICIES", "Lateness", "Report", "Stop", "Ticker", "run_realtime", "stop_on_signals", "undisturbed"]
+__all__ = [
+    "POLICIES", "Lateness", "Report", "Stop", "Ticker", "run_realtime", "stop_on_signals", "undisturbed", "wall_clock",
+]  # fmt: skip
 
 TICK_NS = 1_000_000
 POLICIES = ("catch-up", "skip")
@@ -52,6 +54,7 @@ PAUSED_NS = (
 DEAF = 50
 SPIN_US = 50  # a sleep ends up to 50 us late; the spin hides that
 MOST_READ = 64  # frames taken in one tick (a full 500 kbit/s bus carries five); the rest wait for the next
+MOST_NOTES = 4  # of the loop and of the node, behind them
 
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -329,6 +332,12 @@ def packed(ns: int, received: np.ndarray, sent: np.ndarray) -> bytes:
     return b"".join(out)
 
 
+def wall_clock() -> Callable[[], int]:
+    """Return a clock of ms since 1970 that nobody sets while it runs."""
+    zero = time.time_ns() - time.monotonic_ns()
+    return lambda: (zero + time.monotonic_ns()) // TICK_NS
+
+
 def _drop(read: Callable[[np.ndarray], int], rows: np.ndarray) -> int:
     """Take what has come and forget it; return how much it was."""
     dropped = n = read(rows)
@@ -361,12 +370,13 @@ def run_realtime(
 
     ticker = ticker or Ticker()
     stop = Stop() if stop is None else stop  # one that nobody has asked yet is false
-    rows = np.zeros((MOST_READ, 2), np.int64)
+    rows = np.zeros((MOST_READ + MOST_NOTES, 2), np.int64)
+    room = rows[:MOST_READ]
     report = Report()
     read, write, tick, clock = port.read, port.write, node.tick, time.monotonic_ns
     heed = getattr(node, "heed", None)
     add_begin, add_end, add_work = report.begin.add, report.end.add, report.work.add
-    while port.read(rows):  # what came while nobody listened is old
+    while port.read(room):  # what came while nobody listened is old
         pass
     report.started_ns = (time.time_ns() // TICK_NS + 1) * TICK_NS
     ticker.begin()
@@ -378,11 +388,11 @@ def run_realtime(
             if ticker.paused:
                 deaf = k + DEAF
             if k < deaf:
-                report.dropped += _drop(read, rows)
+                report.dropped += _drop(read, room)
                 rows[0] = PAUSE, ticker.paused
                 n = 1 if ticker.paused else 0
             else:
-                n = read(rows)
+                n = read(room)
             if heed is not None:
                 n = heed(rows, n)
             out = tick(rows, n)

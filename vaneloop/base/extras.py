@@ -19,6 +19,7 @@ EXTRAS = {
     "fmu": {"fmpy": "fmpy"},
     "diagnostics": {"isotp": "can-isotp"},
     "multibody": {"exudyn": "exudyn"},
+    "secoc": {"cryptography": "cryptography"},
 }  # fmt: skip
 
 

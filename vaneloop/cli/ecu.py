@@ -68,6 +68,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--seed", metavar="N", type=int, help="noisy measured speed, with this seed (default: noise-free)"
     )
     options.add_reading_options(parser.add_argument_group("reading the log (docs/logs.md)"))
+    station.add_secoc_option(parser)
     station.add_realtime_options(parser)
     terminal.add_output_options(parser)
     parser.add_argument(
@@ -122,10 +123,11 @@ def demand_of(args: argparse.Namespace, notes: list[str], default: str | None = 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     from controller import FAULTS, MODES
+    from hil.bus.frames import R_GOOD, R_LOST, R_UNAUTHENTIC
     from hil.bus.port import Port
     from hil.loop.ecu import EcuStation, Typed
     from hil.loop.node import Ecu
-    from hil.loop.realtime import Ticker, run_realtime, stop_on_signals
+    from hil.loop.realtime import Ticker, run_realtime, stop_on_signals, wall_clock
     from vaneloop.base.errors import InputError
 
     station.check_realtime_options(args)
@@ -137,6 +139,7 @@ def command(args: argparse.Namespace) -> int:
         raise InputError(
             "--bus lockstep exists within one process: vaneloop run --bus lockstep --profile F has an ECU of its own"
         )
+    authenticator = station.authenticator(args)
     machine = options.machine_of(args).plant
     read_notes: list[str] = []
     demand = demand_of(args, read_notes)
@@ -148,6 +151,11 @@ def command(args: argparse.Namespace) -> int:
         source, timeout=args.timeout, wait=args.wait, mode_request=int(args.mode == "run"),
         ecu=Ecu(machine, n_dem=first, seed=args.seed),
     )  # fmt: skip
+    node: Any = ecu
+    if authenticator is not None:
+        from hil.loop.secured import FROM_CONTROLLER, Secured
+
+        node = Secured(ecu, authenticator, FROM_CONTROLLER, wall_clock())
     duration = args.duration if args.duration is not None or demand is None else demand.duration
     complaint = ""
     with (
@@ -181,11 +189,15 @@ def command(args: argparse.Namespace) -> int:
             bus_watch(k)
             return done(k)
 
-        terminal.say(args, f"ECU on {name}, {args.profile or args.log or Typed.HELP}; Ctrl-C ends")
+        terminal.say(
+            args,
+            f"ECU on {name}, {args.profile or args.log or Typed.HELP}; {station.authentication_words(args)}; Ctrl-C "
+            f"ends",
+        )
         try:
             with station.undisturbed(args) as notes:
                 report = run_realtime(
-                    ecu, port, ticker=Ticker(spin_us=args.spin_us, policy=args.policy), stop=stop,
+                    node, port, ticker=Ticker(spin_us=args.spin_us, policy=args.policy), stop=stop,
                     live=show if live.on else None,
                     watch=watch,
                 )  # fmt: skip
@@ -197,7 +209,8 @@ def command(args: argparse.Namespace) -> int:
         complaint = report.ended
     values, receivers = ecu.ecu.values, ecu.ecu.arrays.receiver
     state = MODES[int(values["state"])] if values["state"] == values["state"] else "never heard"
-    good, lost = int(receivers[:, 0].sum()), int(receivers[:, 7].sum())
+    good, lost = int(receivers[:, R_GOOD].sum()), int(receivers[:, R_LOST].sum())
+    unauthentic = int(receivers[:, R_UNAUTHENTIC].sum())
     ended = f", ended by {report.ended}" if report.ended.startswith("SIG") else ""
     terminal.say(args, f"{ecu.t:,.3f} s of demand on {name}{ended}; controller: {state}")
     terminal.say(
@@ -211,12 +224,14 @@ def command(args: argparse.Namespace) -> int:
         f"lateness: p50 {f['p50_us']:,.1f}, p99 {f['p99_us']:,.1f}, max {f['max_us']:,.1f} us; missed ticks "
         f"{report.missed:,}",
     )
+    station.say_authentication(args, node, unauthentic)
     if complaint:
         print(f"vaneloop ecu: {complaint}", file=sys.stderr)
     terminal.write_json(args, {
         "schema": 1, "bus": name, "ended": report.ended or "done", "demand_s": ecu.t, "state": state, "values": values,
         "frames": {"sent": report.sent, "refused": port.refused, "good": good, "lost": lost,
-        "lost_by_reader": port.lost},
+        "lost_by_reader": port.lost, "unauthentic": unauthentic},
+        "secoc": station.authentication_json(args, node),
         **station.realtime_json(report), "notes": [*read_notes, *notes], "complaint": complaint,
     })  # fmt: skip
     return 1 if complaint else 0

@@ -80,6 +80,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--log", metavar="F", help="demand of the run's own ECU from a log")
     options.add_reading_options(parser.add_argument_group("reading the log (docs/logs.md)"))
     attended.add_service_options(parser)
+    station.add_secoc_option(parser)
     station.add_realtime_options(parser)
     terminal.add_output_options(parser)
     parser.add_argument(
@@ -177,17 +178,29 @@ def _node_json(node: Any) -> dict[str, Any]:
     }
 
 
+def _secured(args: argparse.Namespace, node: Any, authenticator: Any, clock: Any = None) -> Any:
+    """The node with authentication, where that is on."""
+    if authenticator is None:
+        return node
+    from hil.loop.secured import DEMANDED, Secured
+
+    return Secured(node, authenticator, DEMANDED, clock)
+
+
 def _say_node(args: argparse.Namespace, node: Any) -> None:
     c, state = node.counts, _node_json(node)
     faults = ", ".join(state["faults"]) or "none"
     for name, o in state.get("own", {}).items():
         terminal.say(args, f"{name}: {o['value']:g} {o['unit']} ({o['meaning']})")
-    refused = sum(c[k] for k in ("wrong_crc", "repeated", "wrong_sequence", "wrong_length", "wrong_kind"))
+    refused = sum(
+        c[k] for k in ("wrong_crc", "repeated", "wrong_sequence", "wrong_length", "wrong_kind", "unauthentic")
+    )
     terminal.say(
         args,
         f"controller: {node.mode}; faults now: {faults}; ECU_DEMAND good {c['good']:,}, lost {c['lost']:,}, refused "
         f"{refused:,}",
     )
+    station.say_authentication(args, node, c["unauthentic"])
     terminal.say(args, f"state hash: {state['state_hash']}")
 
 
@@ -196,13 +209,14 @@ def _say_node(args: argparse.Namespace, node: Any) -> None:
 
 def _in_real_time(args: argparse.Namespace, name: str) -> int:
     from hil.bus.port import Port
-    from hil.loop.realtime import Ticker, run_realtime, stop_on_signals
+    from hil.loop.realtime import Ticker, run_realtime, stop_on_signals, wall_clock
 
+    authenticator = station.authenticator(args)
     machine = options.machine_of(args)
     node = _node(args, machine)
     _say_engine(args, machine, name)
     ticks = None if args.duration is None else round(args.duration * 1000)
-    serviced = attended.attend(args, node)
+    serviced = _secured(args, attended.attend(args, node), authenticator, wall_clock())
     accepted = attended.accepted(args)
     with stop_on_signals() as stop, station.joined(name, args.realtime_priority, can_filters=accepted) as bus:
         port = Port(bus)
@@ -219,8 +233,8 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
         with station.recording(args, name) as recorder:
             terminal.say(
                 args,
-                f"controller and plant on {name}, 1 kHz{'' if ticks is None else f', {args.duration:g} s'}; Ctrl-C "
-                f"ends",
+                f"controller and plant on {name}, 1 kHz{'' if ticks is None else f', {args.duration:g} s'}, "
+                f"{station.authentication_words(args)}; Ctrl-C ends",
             )
             try:
                 with station.undisturbed(args) as notes:
@@ -240,7 +254,7 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
         f"frames: {report.received:,} taken, {report.sent:,} sent, {port.refused:,} not taken by the bus, "
         f"{port.lost:,} lost",
     )
-    _say_node(args, node)
+    _say_node(args, serviced)
     exceeded = []
     if report.failed:
         exceeded.append(report.failed)
@@ -261,7 +275,8 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
         "policy": args.policy, "realtime_priority": args.realtime_priority, "spin_us": args.spin_us, "notes": notes,
         "frames": {"received": report.received, "sent": report.sent, "refused": port.refused, "lost": port.lost,
         "bus_errors": port.errors},
-        **_node_json(node), "record": record, "exceeded": exceeded,
+        **_node_json(node), "secoc": station.authentication_json(args, serviced), "record": record,
+        "exceeded": exceeded,
     })  # fmt: skip
     return 1 if exceeded else 0
 
@@ -292,18 +307,27 @@ def _in_lockstep(args: argparse.Namespace) -> int:
     from hil.loop.node import Ecu, replay
     from vaneloop.cli.ecu import demand_of
 
+    authenticator = station.authenticator(args)
     notes: list[str] = []
     demand = demand_of(args, notes, default="ramp")
     profile = demand.per_frame()
     machine = options.machine_of(args)
     node = _node(args, machine)
     ecu = Ecu(machine.plant, n_dem=float(profile[0, 0]), seed=None if args.seed is None else args.seed + 1)
+    secured, duration = _secured(args, node, authenticator), args.duration or demand.duration
+    start, whole = time.time_ns() // 10**9 * 1000, None
     with terminal.progress_bar(args, "lockstep") as progress:
-        run = run_lockstep(
-            profile[:, 0], profile[:, 1], vgv=node, ecu=ecu,
-            duration=args.duration if args.duration is not None else demand.duration,
-            keep=bool(args.record), progress=progress,
-        )  # fmt: skip
+        if authenticator is not None:
+            from hil.loop.secured import FROM_CONTROLLER, Secured, run_secured
+
+            other = Secured(ecu, authenticator, FROM_CONTROLLER)
+            whole = run_secured(profile, secured, other, start=start, duration=duration, progress=progress)
+            run = whole.run
+        else:
+            run = run_lockstep(
+                profile[:, 0], profile[:, 1], vgv=node, ecu=ecu, duration=duration,
+                keep=bool(args.record), progress=progress,
+            )  # fmt: skip
     ticks = node.k
     terminal.say(
         args,
@@ -314,9 +338,11 @@ def _in_lockstep(args: argparse.Namespace) -> int:
         args,
         f"bus: {run.frames:,} frames, {run.error_frames:,} error frames, load {100 * run.load:.1f} % of 500 kbit/s",
     )
-    _say_node(args, node)
+    _say_node(args, secured)
     record = None
-    if args.record:
+    if whole is not None and args.record:
+        record = _write_record(args, whole.taken, whole.taken_at, whole.sent_at, whole.sent, start)
+    elif args.record:
         # a frame is taken in the first tick that begins after its last bit; in which ticks frames were sent, the same
         # ticks say again
         tick = -(-np.rint(run.t * BIT_RATE).astype(np.int64) // BITS_PER_TICK)
@@ -325,13 +351,12 @@ def _in_lockstep(args: argparse.Namespace) -> int:
         at, sent = replay(again, tick[taken], run.rows[taken], ticks)
         if again.fingerprint() != node.fingerprint():
             raise RuntimeError("the run does not repeat with the frames that it took: a fault of vaneloop")
-        start = time.time_ns() // 10**9 * 1000
         record = _write_record(args, run.rows[taken], tick[taken], at, sent, start)
     terminal.write_json(args, {
         "schema": 1, "bus": "lockstep", "time": "simulated", "ticks": ticks, "simulated_s": run.simulated_s,
         "wall_s": run.wall_s,
         "bus_load": run.load, "frames": {"on_the_bus": run.frames, "error_frames": run.error_frames},
-        **_node_json(node),
+        **_node_json(node), "secoc": station.authentication_json(args, secured),
         "record": record, **({"notes": notes} if args.log or args.profile else {}), "exceeded": [],
     })  # fmt: skip
     return 0
@@ -342,12 +367,20 @@ def _repeat(args: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from hil.bus.frames import HEAD_MASK, NAMES, PAUSE, PREPARED
+    from hil.bus.frames import AUTH_NAMES, FRESHNESS, HEAD_MASK, NAMES, PAUSE, PREPARED
     from hil.logs.recorder import read_record
     from hil.loop.node import replay
     from vaneloop.base.errors import InputError
 
+    authenticator = station.authenticator(args)
     record = read_record(args.inputs)
+    secured = bool((record.rows[:, 0] == FRESHNESS).any())
+    if secured != (authenticator is not None):
+        raise InputError(
+            f"{args.inputs}: was recorded with authentication: --secoc KEY, with the key of then, repeats it"
+            if secured
+            else f"--secoc: {args.inputs} was recorded without authentication"
+        )
     node = _node(args)
     # the first frame sent is VGV_STATUS of tick 0; a record of another program's knows no directions and begins with
     # its first frame
@@ -372,10 +405,11 @@ def _repeat(args: argparse.Namespace) -> int:
             f"record of an earlier vaneloop they are the loop's pauses, and such a record does not repeat"
         )
         terminal.say(args, f"note: {notes[0]}")
-    if attended.wanted(args):
+    whole = _secured(args, attended.attend(args, node, recorded=True), authenticator)
+    if whole is not node:
         from hil.calibrate.station import replay_attended
 
-        at, sent = replay_attended(attended.attend(args, node, recorded=True), tick[taken], received, ticks)
+        at, sent = replay_attended(whole, tick[taken], received, ticks)
     else:
         at, sent = replay(node, tick[taken], received, ticks)
     wall = time.perf_counter() - started
@@ -394,23 +428,26 @@ def _repeat(args: argparse.Namespace) -> int:
         if not same.all():
             k = int(np.argmin(same))
             before, now = (
-                f"tick {int(tick):,} {NAMES.get(int(row[0]) & 0x7FF, '?')} "
+                f"tick {int(tick):,} {(NAMES | AUTH_NAMES).get(int(row[0]) & 0x7FF, '?')} "
                 f"{int(row[1]).to_bytes(8, 'little', signed=True).hex().upper()}"
                 for tick, row in ((was_at[k], was[k]), (at[k], sent[k]))
             )
-            needed = "the same --seed, --model, --tables and --start-speed are needed"
+            needed = "the same --seed, --model, --tables and --start-speed are needed" + (
+                ", and the same key" if secured else ""
+            )
             exceeded.append(f"frame {k + 1:,} of {len(was):,}: {before} was sent, now {now}; {needed}")
         elif len(was) != len(sent):
             exceeded.append(f"{len(was):,} frames were sent, now {len(sent):,}")
         else:
             terminal.say(args, f"all {len(was):,} frames sent are the same, bit for bit, in the same ticks")
-    _say_node(args, node)
+    _say_node(args, whole)
     for line in exceeded:
         terminal.say(args, f"differs: {line}")
     terminal.write_json(args, {
         "schema": 1, "bus": "lockstep", "time": "simulated", "inputs": args.inputs, "ticks": ticks,
         "simulated_s": ticks / 1000,
-        "wall_s": wall, "compared": len(was), "same": not exceeded, **_node_json(node), "notes": notes,
+        "wall_s": wall, "compared": len(was), "same": not exceeded, **_node_json(node),
+        "secoc": station.authentication_json(args, whole), "notes": notes,
         "exceeded": exceeded,
     })  # fmt: skip
     if args.record:

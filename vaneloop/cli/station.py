@@ -15,9 +15,9 @@ from typing import Any
 from vaneloop.base import terminal
 
 __all__ = [
-    "ACCEPTED", "BUS_HELP", "BusWatch", "Live", "add_realtime_options", "bus_name", "check_realtime_options",
-    "check_seconds", "joined",
-    "print_lateness", "realtime_json", "recording", "undisturbed", "warm_nodes",
+    "ACCEPTED", "BUS_HELP", "BusWatch", "Live", "add_realtime_options", "add_secoc_option", "authentication_json",
+    "authentication_words", "authenticator", "bus_name", "check_realtime_options", "check_seconds", "joined",
+    "print_lateness", "realtime_json", "recording", "say_authentication", "undisturbed", "warm_nodes",
 ]  # fmt: skip
 
 # both nodes' acceptance filter: 0x0A0 to 0x0BF, so that a flood of other identifiers costs a tick nothing
@@ -45,6 +45,46 @@ def add_realtime_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--spin-us", metavar="N", type=float, default=50.0, help="us before a deadline not slept but spun (default 50)"
     )
+
+
+def add_secoc_option(parser: argparse.ArgumentParser) -> None:
+    """Declare the option that turns authentication on."""
+    parser.add_argument(
+        "--secoc",
+        metavar="KEY",
+        help="authenticate frames (SecOC, docs/bus.md) with the key in the file KEY (mode 600), or env: that in "
+        "VANELOOP_SECOC_KEY (default: off)",
+    )
+
+
+def authenticator(args: argparse.Namespace) -> Any:
+    """Return what makes and checks MACs under the key of ``--secoc``; None without it."""
+    if args.secoc is None:
+        return None
+    from hil.bus.secoc import Authenticator, read_key
+
+    return Authenticator(read_key(args.secoc))
+
+
+def authentication_words(args: argparse.Namespace) -> str:
+    """Whether authentication is on, for the line at the start."""
+    return f"authentication {'off' if args.secoc is None else 'on (SecOC)'}"
+
+
+def authentication_json(args: argparse.Namespace, node: Any) -> dict[str, int] | None:
+    """Return what a secured node has counted; None where authentication is off."""
+    return None if args.secoc is None else node.authentication
+
+
+def say_authentication(args: argparse.Namespace, node: Any, unauthentic: int) -> None:
+    """Say what a secured node has counted, and how many frames it refused for it."""
+    if args.secoc is not None:
+        c = node.authentication
+        terminal.say(
+            args,
+            f"authentication: {c['verified']:,} frames proven, {unauthentic:,} refused ({c['missing']:,} without a "
+            f"MAC); MACs refused: {c['wrong_mac']:,} wrong, {c['stale']:,} stale, {c['unmatched']:,} without a frame",
+        )
 
 
 def check_realtime_options(args: argparse.Namespace) -> None:
