@@ -62,6 +62,7 @@ def test_a_file_keeps_its_mode_also_where_a_library_makes_it_anew(tmp_path: Path
     files.write(tmp_path / "a", NEW)
     assert mode_of(tmp_path / "a") == mode and (tmp_path / "a").read_bytes() == NEW
     with files.whole(tmp_path / "a") as part:
+        assert mode_of(part) & ~mode == 0, "others must not read what they may not read in the end"
         part.unlink()
         part.write_bytes(OLD)
     assert mode_of(tmp_path / "a") == mode and (tmp_path / "a").read_bytes() == OLD

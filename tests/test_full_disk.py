@@ -24,7 +24,7 @@ import pytest
 from hil.calibrate import elements, prepare
 from hil.logs import Channel, LogError, log, read_log, write_log
 from hil.logs.recorder import SUFFIXES, Recorder, read_record
-from hil.native import crash_log
+from hil.native import black_box, crash_log
 from hil.native.black_box import Box
 from hil.uds import TroubleMemory
 from tests.conftest import ROOT
@@ -405,6 +405,19 @@ def test_a_crash_log(tmp_path: Path) -> None:
         with full_at(size):
             assert crash_log.write(str(file), box, "it fell") == f"no crash log: cannot write {file}: File too large"
         assert held(tmp_path) == {file.name: OLD}
+
+
+def test_a_black_box_has_its_place_on_the_disk_before_the_controller_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is memory that is a file: where the disk has no place for it, a tick would end with SIGBUS."""
+    _, cal = shipped()
+    monkeypatch.setattr(black_box, "_WATCHED", [(tmp_path, 1)])
+    head, rows = black_box.new("c.so", cal)
+    (box,) = (f for f in tmp_path.iterdir() if f.suffix != ".json")
+    assert box.stat().st_blocks * 512 >= head.nbytes + rows.nbytes
+    with full_at(100), pytest.raises(InputError, match=f"^cannot write {tmp_path}: File too large$"):
+        black_box.new("c.so", cal)
 
 
 @pytest.mark.parametrize("there", [True, False])

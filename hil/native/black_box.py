@@ -19,6 +19,8 @@ import numpy as np
 
 from controller import INPUTS, Calibration
 from hil.native.call import CALL, CALLS, ENTERED, N_HEAD, REASON, REASONS, RETURNED, STEP, VALUE
+from vaneloop.base.errors import InputError
+from vaneloop.base.files import cannot_write
 
 __all__ = ["Box", "begun", "calling", "controller", "new", "progress", "watched"]
 
@@ -40,21 +42,24 @@ def begun() -> bool:
 
 def new(path: str, calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
     """Return the head (float64[N_HEAD], `hil.native.call`) and the rows (float64[n, inputs]) of a new box, of the
-    controller ``path`` with ``calibration``.
+    controller ``path`` with ``calibration``. Raises InputError where the disk is full.
     """
     if not _WATCHED:
         return np.zeros(N_HEAD), np.zeros((1, len(INPUTS)))
     folder, rows = _WATCHED[0]
     handle, name = tempfile.mkstemp(prefix="box-", dir=folder)
+    flashed = {name: getattr(calibration, name).tolist() for name in ("k", "table", "angles")}
     try:
         os.ftruncate(handle, 8 * (_HEAD + rows * len(INPUTS)))
+        os.posix_fallocate(handle, 0, 8 * (_HEAD + len(INPUTS)))  # else a full disk is a SIGBUS at the first tick
         block = mmap.mmap(handle, 0)
         block.madvise(mmap.MADV_DONTFORK)  # a copy of this process that the controller makes ends with its next tick
         whole = np.frombuffer(block, np.float64)
+        Path(f"{name}.json").write_text(json.dumps({"controller": path, "calibration": flashed}), encoding="utf-8")
+    except OSError as e:
+        raise InputError(cannot_write(folder, e)) from None
     finally:
         os.close(handle)
-    flashed = {name: getattr(calibration, name).tolist() for name in ("k", "table", "angles")}
-    Path(f"{name}.json").write_text(json.dumps({"controller": path, "calibration": flashed}), encoding="utf-8")
     return whole[:N_HEAD], whole[_HEAD:].reshape(rows, len(INPUTS))
 
 

@@ -1,7 +1,8 @@
 """Every file that is written for a user: whole, or as it was before, whatever is killed and however full the disk is.
 
 A temporary file beside the target is written, brought to the disk, and takes the target's name in one step (rename(2)).
-So a file that is read may be written under its own name. Only the standard library is imported here.
+So a file that is read may be written under its own name. A kill may leave the temporary file, `.NAME.*.part`.
+Only the standard library is imported here.
 """
 
 from __future__ import annotations
@@ -133,7 +134,8 @@ def _begin(path: str | Path, only_new: bool = False) -> _Target:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), name)
     part = os.path.join(folder, f".{last[:40]}.{uuid.uuid4().hex[:12]}.part")
     try:
-        os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+        mode = 0o666 if old is None else old.st_mode & 0o666 | 0o200  # no one reads it who may not read the old one
+        os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode))
     except PermissionError:
         if old is None:
             raise
