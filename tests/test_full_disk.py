@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import json
 import os
 import re
@@ -27,6 +28,7 @@ from hil.logs.recorder import SUFFIXES, Recorder, read_record
 from hil.native import black_box, crash_log
 from hil.native.black_box import Box
 from hil.uds import TroubleMemory
+from plant import load_geometry, load_schedules
 from tests.conftest import ROOT
 from tests.test_fleet_report import synthetic
 from tests.test_help import parser_of
@@ -39,6 +41,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.cli import blind
 from vaneloop.cli.attended import _Keeper
 from vaneloop.cli.main import COMMANDS, main
+from vaneloop.design.schedule_files import write_tables
 from vaneloop.pages.page import Page
 from vaneloop.verbs.learn import Learned
 
@@ -364,6 +367,27 @@ def test_calibration_tables_change_together(tmp_path: Path) -> None:
     with full_at(500):
         number, why = prepare.save(of, row, tmp_path)
     assert number == prepare.DENIED and why.endswith(": File too large")
+
+
+@pytest.mark.parametrize("fit", range(4))
+def test_schedule_tables_change_together(fit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk is full after ``fit`` of the four files."""
+    geometry, schedules = load_geometry("geometry.toml"), load_schedules("schedules.toml")
+    result: Any = SimpleNamespace(table=np.zeros((4, 9)), geometry=geometry, schedules=schedules, origin="measured")
+    for file in write_tables(result, tmp_path):
+        file.write_bytes(OLD)
+    begun: list[object] = []
+
+    def begin(path: str | Path, only_new: bool = False) -> Any:
+        begun.append(path)
+        if len(begun) > fit:
+            raise OSError(errno.ENOSPC, "full")
+        return BEGIN(path, only_new)
+
+    monkeypatch.setattr(files, "_begin", begin)
+    with pytest.raises(InputError, match=r"^cannot write .*\.toml: No space left on device$"):
+        write_tables(result, tmp_path)
+    assert held(tmp_path) == dict.fromkeys(held(tmp_path), OLD) and len(held(tmp_path)) == 4
 
 
 def test_trouble_codes_are_kept(tmp_path: Path) -> None:
