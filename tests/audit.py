@@ -29,7 +29,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PERMISSIVE = "asks that its text and its authors are named"
 LIBRARY = "used as it is, as a library that its user may exchange; its own files stay under it"
 ALLOWED = {
-    **dict.fromkeys(("0BSD", "CC0-1.0", "Zlib"), "asks for nothing that we could miss"),
+    **dict.fromkeys(("0BSD", "CC0-1.0", "MIT-0", "Zlib"), "asks for nothing that we could miss"),
     **dict.fromkeys(("Apache-2.0", "Apache-2.0 WITH LLVM-exception", "ISC", "MIT", "MIT-CMU", "PSF-2.0"), PERMISSIVE),
     **dict.fromkeys(("BSD", "BSD-2-Clause", "BSD-3-Clause"), PERMISSIVE),
     "LicenseRef-EXUDYN-General-License": "the BSD 3-Clause in words of its own",

@@ -116,13 +116,14 @@ def rivals(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def trials(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A campaign whose trials are done."""
     for name, gives in (
-        ("begin", (SimpleNamespace(search=None), None, None)),
+        ("begin", (SimpleNamespace(search=None), None, SimpleNamespace(damaged=[]))),
         ("take_samples", 0),
         ("take_searches", 0),
     ):
         monkeypatch.setattr(f"vaneloop.fleet.campaign.{name}", lambda *_, gives=gives: gives)
     monkeypatch.setattr("vaneloop.fleet.campaign.judge", lambda *_: campaign([group()]))
-    for name in ("_work", "_show"):
+    monkeypatch.setattr("vaneloop.fleet.plan.load_plan", lambda _: SimpleNamespace(firmware=[]))
+    for name in ("_work", "_show", "tell_damaged"):
         monkeypatch.setattr(f"vaneloop.cli.campaign.{name}", lambda *_: None)
 
 
@@ -299,14 +300,19 @@ def test_every_file_of_a_command_is_the_old_one_where_the_disk_is_full(
 # ---- what the commands above do not write ---------------------------------------------------------------------------
 
 
-def kept_when_full(folder: Path, write: Callable[[], object], error: type[Exception] = InputError) -> None:
-    """Hold that ``write`` leaves ``folder`` as it is, wherever the disk is full; and that it writes on an empty one."""
+def kept_when_full(
+    folder: Path, write: Callable[[], object], error: type[Exception] = InputError, dated: int = 0
+) -> None:
+    """Hold that ``write`` leaves ``folder`` as it is, wherever the disk is full; and that it writes on an empty one.
+
+    dated  bytes by which the file's length differs from one time to the next
+    """
     old = held(folder)
     write()
     new = held(folder)
     changed = [n for n in new if new[n] != old.get(n)]
     assert changed
-    for size in sizes(max(len(new[n]) for n in changed)):
+    for size in sizes(max(len(new[n]) for n in changed) - dated):
         for name in changed:
             (folder / name).write_bytes(old[name]) if name in old else (folder / name).unlink()
         with full_at(size), pytest.raises(error, match=r"^cannot write .*: File too large$"):
@@ -325,7 +331,8 @@ def test_a_log_of_every_format(suffix: str, tmp_path: Path) -> None:
     file, _, frames = (tmp_path / f"a{suffix}").as_posix().partition(" ")
     dbc = ROOT / "tables" / "vgv.dbc" if frames else None
     Path(file).write_bytes(OLD)
-    kept_when_full(tmp_path, lambda: write_log(file, CHANNELS, dbc=dbc), LogError)
+    dated = 40 if suffix in (".asc", ".trc") else 0
+    kept_when_full(tmp_path, lambda: write_log(file, CHANNELS, dbc=dbc), LogError, dated)
     write_log(file, CHANNELS, dbc=dbc)
     assert read_log(file).channels["n_dem"].values[-1] == pytest.approx(CHANNELS["n_dem"].values[-1], abs=0.1)
 
@@ -420,7 +427,7 @@ def test_a_law_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_crash_log(tmp_path: Path) -> None:
     _, cal = shipped()
     flashed = {name: getattr(cal, name).tolist() for name in ("k", "table", "angles")}
-    box = Box("c.so", flashed, 99, np.zeros((100, len(crash_log.INPUTS))), 0, 0.0)
+    box = Box("c.so", flashed, "step", 99, np.zeros((100, len(crash_log.INPUTS))), 0, 0.0)
     file = tmp_path / "c.parquet"
     assert crash_log.write(str(file), box, "it fell") == f"crash log: {file}"
     whole = file.stat().st_size
