@@ -161,8 +161,9 @@ class Disturber:
         return times + -(-idle // w.RECESSIVE)
 
 
-def sender_of(action: OnFrame) -> str:
+def sender_of(action: Action) -> str:
     """Return the node whose frames the action works on."""
+    assert isinstance(action, OnFrame)
     ident = identifier(action.frame)
     name = frames.NAMES.get(ident) or frames.NAMES[ident - frames.AUTH]
     return next(who for who, names in SENDER.items() if name in names)

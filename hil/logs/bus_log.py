@@ -90,8 +90,14 @@ def bus_reader(read: Callable[[Path], Frames]) -> Callable[[Path, Options], Sour
 def open_bus_log(frames: Frames, options: Options) -> Bus:
     """Frames seen through the database that the user named, or the product's own."""
     dbc = options.dbc or tables.path("vgv.dbc")
-    messages, notes = load_dbc(dbc)
-    return Bus(frames, messages, list(notes), dbc)
+    messages, said = load_dbc(dbc)
+    notes = list(said)
+    if n := int(np.isin(frames.ident, [m.ident for m in messages if m.proves]).sum()):
+        notes.append(
+            f"{n:,} authentication frames (SecOC) in the log: no MAC is checked; vaneloop run --bus lockstep --inputs "
+            f"LOG --secoc KEY checks those of a record"
+        )
+    return Bus(frames, messages, notes, dbc)
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------

@@ -33,6 +33,7 @@ class Message:
     e2e         DataID of AUTOSAR E2E profile 1, None where the message has none
     j1939       raw values with 0xFE or 0xFF on top mean error or not available (J1939-71)
     missing     signal -> raw value that means not available (attribute NotAvailable of vgv.dbc)
+    proves      whether it carries the MAC of another message (attribute AuthenticatorOf of vgv.dbc)
     """
 
     layout: Any  # cantools.database.can.Message
@@ -40,6 +41,7 @@ class Message:
     e2e: int | None
     j1939: bool
     missing: dict[str, int]
+    proves: bool = False
 
 
 def load_dbc(path: Path) -> tuple[list[Message], list[str]]:
@@ -103,4 +105,5 @@ def _message(m: Any) -> Message:
     frame_format = attributes.get("VFrameFormat")
     j1939 = m.protocol == "j1939" or (frame_format is not None and frame_format.value in (3, "J1939PG"))
     ident = m.frame_id | (EXTENDED if m.is_extended_frame else 0)
-    return Message(m, ident, e2e, j1939 and m.is_extended_frame, missing)
+    proves = bool(number(attributes, "AuthenticatorOf"))
+    return Message(m, ident, e2e, j1939 and m.is_extended_frame, missing, proves)

@@ -24,8 +24,10 @@ from hil.bus.wire import BITS_PER_TICK, ERRORS, FRAMES, put, run_wire, take
 
 __all__ = ["DEMANDED", "FROM_CONTROLLER", "HOLD", "Gate", "Secured", "run_secured", "started"]
 
-HOLD = 10  # ticks in which the MAC of a frame must come: until its next is due
-MOST_WAITING = 16  # frames of an identifier that wait; a classic bus brings no more between a frame and its MAC
+# ticks in which the MAC of a frame must come: as long as a silence. A loop that catches up runs up to 49 ticks between
+# a frame and a MAC that came right behind it.
+HOLD = 50
+MOST_WAITING = 16  # frames of an identifier that wait; five are the sender's, if none of its MACs comes
 BEHIND = 100  # ms that the freshness value may lag behind the clock until a note corrects it
 DEMANDED = (frames.ECU_DEMAND,)  # what the controller takes
 FROM_CONTROLLER = tuple(i for i in frames.NAMES if i != frames.ECU_DEMAND)  # what the ECU takes
@@ -90,14 +92,14 @@ class Gate:
             while waiting and k - waiting[0].since >= HOLD:
                 out.append(self._unproven(ident, waiting.pop(0)))
         for head, data in rows:
-            if (ident := self._data.get(head)) is not None:
-                waiting = self._waiting[ident]
+            if (held := self._data.get(head)) is not None:
+                waiting = self._waiting[held]
                 if len(waiting) == MOST_WAITING:
-                    out.append(self._unproven(ident, waiting.pop(0)))
+                    out.append(self._unproven(held, waiting.pop(0)))
                 waiting.append(_Waiting(data, k))
-            elif (ident := self._auth.get(head)) is not None:
-                if (found := self._judge(k, ident, data)) is not None:
-                    out.append((int(frames.word0(ident)), found.data))
+            elif (of := self._auth.get(head)) is not None:
+                if (found := self._judge(k, of, data)) is not None:
+                    out.append((int(frames.word0(of)), found.data))
             elif head != frames.FRESHNESS:
                 if head == frames.PAUSE:  # what waited is as old as the pause
                     for waiting in self._waiting.values():
