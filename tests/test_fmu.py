@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import time
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -27,6 +28,7 @@ from hil.loop.node import Node
 from plant import Model, build_plant
 from plant.model import Learned
 from tests.conftest import ROOT
+from vaneloop.base.errors import InputError
 from vaneloop.base.tables import read
 from vaneloop.cli.main import main
 
@@ -431,3 +433,21 @@ def test_the_standard_s_headers_are_those_of_fmpy() -> None:
     there = Path(fmpy.__file__).parent / "c-code"
     for header in (ROOT / "hil" / "fmu" / "c").glob("fmi[23]*.h"):
         assert header.read_bytes() == (there / header.name).read_bytes(), header.name
+
+
+@pytest.mark.parametrize(("member", "says"), [("modelDescription.xml", "modelDescription.xml has"), ("a", "unpack to")])
+def test_an_fmu_that_unpacks_to_more_than_it_is_worth_is_refused(tmp_path: Path, member: str, says: str) -> None:
+    bomb = tmp_path / "bomb.fmu"
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        if member != "modelDescription.xml":
+            archive.writestr("modelDescription.xml", "<fmiModelDescription fmiVersion='3.0'/>")
+        with archive.open(member, "w") as out:
+            for _ in range(90):
+                out.write(bytes(1 << 20))
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=says):
+            PlantFmu(str(bomb), ("vigv",))
+        assert tracemalloc.get_traced_memory()[1] < 4 << 20
+    finally:
+        tracemalloc.stop()

@@ -14,6 +14,7 @@ import struct
 import subprocess
 import sys
 import time
+import tracemalloc
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -485,8 +486,11 @@ def test_what_is_no_recording_is_refused_and_frames_come_in_order(tmp_path: Path
     (tmp_path / "b.log").write_text("# nothing\n")
     with pytest.raises(LogError, match="b.log: (no CAN frame in it|cannot be read as a recording)"):
         read_record(tmp_path / "b.log")
+    (tmp_path / "d.log.gz").write_bytes(b"x" * 300)
+    with pytest.raises(LogError, match="d.log.gz: suffix '.gz' is not a recording's; allowed: .log"):
+        read_record(tmp_path / "d.log.gz")
     (tmp_path / "c.blf").write_bytes(b"x" * 300)
-    with pytest.raises(LogError, match="c.blf: cannot be read as a recording of frames"):
+    with pytest.raises(LogError, match="c.blf: is not a BLF"):
         read_record(tmp_path / "c.blf")
 
 
@@ -988,7 +992,7 @@ def test_a_recorder_that_is_closed_ends_its_file_and_asks_for_an_extra_for_mdf_o
         with pytest.raises(OSError, match="Bad file descriptor"):
             os.fstat(to.file.fd)
         assert len(read_record(tmp_path / f"a{suffix}").ms) == 2
-    assert asked == [f"{tmp_path / 'a.mf4'}: MDF4"] * 2
+    assert asked == [f"{tmp_path / 'a.mf4'}: MDF4"]
 
 
 def test_a_grown_file_that_cannot_be_read_again_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1002,3 +1006,43 @@ def test_a_grown_file_that_cannot_be_read_again_stays(tmp_path: Path, monkeypatc
         broken.setattr(pq, "ParquetFile", unreadable)
         made.close()
     assert pq.read_table(tmp_path / "a.parquet").num_rows == 3
+
+
+def blf_of(objects: bytes) -> bytes:
+    """A Vector binary log of one compressed container."""
+    packed = zlib.compress(objects, 1)
+    head = struct.pack("<4sHHII", b"LOBJ", 16, 1, 32 + len(packed), 10) + struct.pack("<H6xI4x", 2, len(objects))
+    return b"LOGG" + (144).to_bytes(4, "little") + bytes(136) + head + packed
+
+
+def test_a_blf_that_unpacks_to_more_than_it_is_worth_is_refused_on_every_way_in(tmp_path: Path) -> None:
+    file = tmp_path / "bomb.blf"
+    file.write_bytes(blf_of(bytes(80 << 20)))
+    most = (32 << 20) + 50 * file.stat().st_size
+    for read in (read_record, read_log):
+        tracemalloc.start()
+        try:
+            with pytest.raises(LogError, match=f"unpack to more than {most:,}"):
+                read(file)
+            assert tracemalloc.get_traced_memory()[1] < 3 * most
+        finally:
+            tracemalloc.stop()
+
+
+def test_a_blf_with_an_object_of_no_size_ends(tmp_path: Path) -> None:
+    """Of which python-can's reader makes no end; the frames before and behind it are there."""
+    frame = struct.pack("<4sHHIIIHHQ", b"LOBJ", 32, 1, 48, 1, 2, 0, 0, 10) + struct.pack(
+        "<HBBI8s", 1, 0, 8, 0x17C, b"ab"
+    )
+    nothing = struct.pack("<4sHHII", b"LOBJ", 16, 1, 0, 1) + bytes(32)
+    (tmp_path / "a.blf").write_bytes(blf_of(frame + nothing + frame))
+    assert (read_record(tmp_path / "a.blf").rows[:, 0] & 0x7FF).tolist() == [0x17C, 0x17C]
+
+
+def test_a_recording_with_lines_that_are_no_frames_says_nothing_on_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    good = ";$FILEVERSION=2.1\n;$COLUMNS=N,O,T,B,I,d,R,L,D\n1 10.0 DT 1 00A0 Rx - 8 00 01 02 03 04 05 06 07\n"
+    (tmp_path / "a.trc").write_text(good + "no frame\n" * 100)
+    assert len(read_record(tmp_path / "a.trc").ms) == 1
+    assert not caplog.records and not capsys.readouterr().err

@@ -13,6 +13,7 @@ import tempfile
 import weakref
 import zipfile
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
@@ -29,6 +30,10 @@ __all__ = ["INPUTS", "OUTPUTS", "PlantFmu", "PlantNode"]
 _SI = {"i_cmd": "A", "n_dem": "%", "n_r": "%", "p_s": "Pa", "t_oil": "degC", "x_lvdt": "m", "n_engine": "%"}
 INPUTS = ("i_cmd", "n_dem", "n_r", "p_s", "t_oil")  # all but the first may be absent
 OUTPUTS = ("x_lvdt", "n_engine")  # and the stages; n_engine may be absent
+
+_DESCRIPTION = "modelDescription.xml"
+MOST_DESCRIPTION = 32 << 20  # bytes, unpacked; those of whole vehicles have some ten MB
+MOST_UNPACKED = 64 << 20, 50  # bytes that an FMU may unpack to, and more for each of its own
 
 
 class _Joined(NamedTuple):
@@ -167,11 +172,22 @@ def _fmpy(path: str) -> Any:
     return fmpy
 
 
+def _check_size(path: str, archive: zipfile.ZipFile) -> None:
+    """Refuse an archive that unpacks to more than its size is worth; no member gives more bytes than are said here."""
+    size, most = Path(path).stat().st_size, archive.getinfo(_DESCRIPTION).file_size
+    if most > MOST_DESCRIPTION:
+        raise InputError(f"--plant {path}: {_DESCRIPTION} has {most:,} bytes; allowed: {MOST_DESCRIPTION:,}")
+    unpacked, allowed = sum(m.file_size for m in archive.infolist()), MOST_UNPACKED[0] + MOST_UNPACKED[1] * size
+    if unpacked > allowed:
+        raise InputError(f"--plant {path}: {size:,} bytes unpack to {unpacked:,}; allowed: {allowed:,}")
+
+
 def _described(fmpy: Any, path: str) -> Any:
     """Its model description; what cannot be run here is refused."""
     try:
         with zipfile.ZipFile(path) as archive:
-            root = ET.fromstring(archive.read("modelDescription.xml"))
+            _check_size(path, archive)
+            root = ET.fromstring(archive.read(_DESCRIPTION))
         version = root.get("fmiVersion", "")
         if not version.startswith(("2.", "3.")):
             raise InputError(f"--plant {path}: FMI version (={version}) must be 2.0 or 3.0")

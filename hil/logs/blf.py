@@ -13,10 +13,12 @@ import numpy as np
 from hil.logs.frames import Frames, frames_in_order, write_through_can
 from hil.logs.source import LogError, read_bytes
 
-__all__ = ["read_blf", "write_blf"]
+__all__ = ["read_blf", "unpacked", "whole_blf", "write_blf"]
 
 _OBJECT = struct.Struct("<4sHHII")  # signature, header size, header version, size, type
 _CONTAINER, _CAN, _CAN2, _FD, _FD64 = 10, 1, 86, 100, 101
+_HEADER = 144  # bytes of the file's own header
+_PART = 1 << 20  # bytes of a container that is written here
 _MOST = (
     32 << 20,
     50,
@@ -24,18 +26,37 @@ _MOST = (
 
 
 def read_blf(path: Path) -> Frames:
-    """Frames of a Vector binary log.
+    """Frames of a Vector binary log; each kind of object is decoded as one matrix."""
+    stream, damaged = unpacked(path)
+    objects, more = _blf_objects(stream)
+    notes = [f"{damaged + more} damaged places in the BLF: what is there was left out"] if damaged + more else []
+    parts = [part for kind in (_CAN, _CAN2, _FD, _FD64) for part in _blf_frames(stream, objects, kind)]
+    if not parts:
+        raise LogError(f"{path}: no CAN frame in it")
+    order = np.argsort(np.concatenate([p[0] for p in parts]), kind="stable")
+    _, ns, ident, bus, length = (np.concatenate([p[k] for p in parts])[order] for k in range(5))
+    wide = 8 if length.max() <= 8 else 64
+    data = np.zeros((order.size, wide), np.uint8)
+    row = 0
+    for p in parts:
+        w = min(wide, p[5].shape[1])
+        data[row : row + len(p[5]), :w] = p[5][:, :w]
+        row += len(p[5])
+    return frames_in_order(str(path), ns, ident, bus, length, data[order], notes)
 
-    python-can's reader does not return from an object of size 0 and believes any container; here the containers are
-    checked and joined, the objects found, and each kind of object decoded as one matrix. A damaged container costs its
-    own frames.
+
+def unpacked(path: Path) -> tuple[bytes, int]:
+    """The objects of a Vector binary log, its containers unpacked and joined, and how many damaged places were met.
+
+    Every reader of the format begins here. A damaged container costs its own frames; what unpacks to more than `_MOST`
+    is refused.
     """
     raw = read_bytes(path)
-    if len(raw) < 144 or raw[:4] != b"LOGG":
-        raise LogError(f"{path}: is not a BLF (it must begin with LOGG and a header of 144 bytes)")
+    if len(raw) < _HEADER or raw[:4] != b"LOGG":
+        raise LogError(f"{path}: is not a BLF (it must begin with LOGG and a header of {_HEADER} bytes)")
     chunks, damaged, total = [], 0, 0
     most = _MOST[0] + _MOST[1] * len(raw)
-    at = min(max(int.from_bytes(raw[4:8], "little"), 144), len(raw))
+    at = min(max(int.from_bytes(raw[4:8], "little"), _HEADER), len(raw))
     while at + 16 <= len(raw):
         signature, _, _, size, kind = _OBJECT.unpack_from(raw, at)
         if signature != b"LOBJ" or size < 16:
@@ -68,23 +89,28 @@ def read_blf(path: Path) -> Frames:
             )
         chunks.append(body)
         at += size + size % 4
-    stream = b"".join(chunks)
-    del chunks
-    objects, more = _blf_objects(stream)
-    notes = [f"{damaged + more} damaged places in the BLF: what is there was left out"] if damaged + more else []
-    parts = [part for kind in (_CAN, _CAN2, _FD, _FD64) for part in _blf_frames(stream, objects, kind)]
-    if not parts:
-        raise LogError(f"{path}: no CAN frame in it")
-    order = np.argsort(np.concatenate([p[0] for p in parts]), kind="stable")
-    _, ns, ident, bus, length = (np.concatenate([p[k] for p in parts])[order] for k in range(5))
-    wide = 8 if length.max() <= 8 else 64
-    data = np.zeros((order.size, wide), np.uint8)
-    row = 0
-    for p in parts:
-        w = min(wide, p[5].shape[1])
-        data[row : row + len(p[5]), :w] = p[5][:, :w]
-        row += len(p[5])
-    return frames_in_order(str(path), ns, ident, bus, length, data[order], notes)
+    return b"".join(chunks), damaged
+
+
+def whole_blf(path: Path) -> bytes:
+    """A Vector binary log for python-can's reader, which does not return from an object of size 0 and believes any
+    container: the file's own objects, those that are whole, in containers that are not compressed.
+    """
+    stream, _ = unpacked(path)
+    out, part = [read_bytes(path, 4), _HEADER.to_bytes(4, "little"), read_bytes(path, _HEADER)[8:]], bytearray()
+
+    def end_part() -> None:
+        size = _OBJECT.size + 16 + len(part)
+        out.append(_OBJECT.pack(b"LOBJ", _OBJECT.size, 1, size, _CONTAINER))
+        out.append(struct.pack("<H6xI4x", 0, len(part)) + bytes(part))
+        part.clear()
+
+    for at, _, size, _ in _blf_objects(stream)[0].tolist():
+        part += stream[at : at + size] + bytes(-size % 4)
+        if len(part) > _PART:
+            end_part()
+    end_part()
+    return b"".join(out)
 
 
 def _blf_objects(stream: bytes) -> tuple[np.ndarray, int]:

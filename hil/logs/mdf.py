@@ -24,14 +24,15 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from hil.logs.bus_log import encode_channels, open_bus_log
-from hil.logs.frames import EXTENDED, Frames, in_order
+from hil.logs.frames import EXTENDED, Frames, FramesOfRecord, frames_of, in_order
 from hil.logs.names import meaning
+from hil.logs.record_formats import NOTE_CHANNEL
 from hil.logs.source import Channel, LogError, Options, Series, Source, check_file, find, names_held, read_bytes
 from vaneloop.base.extras import needs
 from vaneloop.base.files import whole
 from vaneloop.base.signals import UNITS
 
-__all__ = ["Groups", "open_mdf", "read_mdf", "write_bus", "write_groups", "write_mdf"]
+__all__ = ["Groups", "open_mdf", "read_mdf", "read_record_mdf", "write_bus", "write_groups", "write_mdf"]
 
 _MEMORY = 1 << 30, 40  # bytes the child may take beyond its start, and bytes more for each byte of the file
 _TIME = 20, 1e6  # s of a processor, and bytes of file per further second
@@ -95,6 +96,25 @@ def read_mdf(path: Path, wanted: list[str], guess: bool = False) -> tuple[dict[s
     one of our signals), "comments" of these, "why" (key -> reason it has no numbers), and the frames of its bus
     logging, if any.
     """
+    reply, arrays = _answered(path, {"wanted": wanted, "guess": guess})
+    series = {
+        key: (arrays[f"t{i}"], arrays[f"v{i}"], unit, framed) for key, (i, unit, framed) in reply["series"].items()
+    }
+    parts = []
+    for i in range(reply["buses"]):
+        t, ident, bus, length, data = (arrays[f"b{i}.{k}"] for k in range(5))
+        parts.append((*in_order(str(path), t, notes := []), ident, bus, length, data, notes))  # type: ignore[var-annotated]
+    return {**{k: reply[k] for k in ("names", "comments", "why")}, "series": series}, _merge(parts)
+
+
+def read_record_mdf(path: Path) -> FramesOfRecord:
+    """Frames of an MDF4 file as python-can reads them, with their directions."""
+    _, arrays = _answered(path, {"record": True})
+    return arrays["us"], arrays["rows"], arrays["sent"]
+
+
+def _answered(path: Path, request: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """What the child answers to a request on a file, and its arrays. Every reader of the format asks here."""
     head = read_bytes(path, 168)
     if head[:8] not in (b"MDF     ", b"UnFinMF ") or len(head) < 168 or head[64:68] != b"##HD":
         old = head[:8] == b"MDF     " and head[8:9] in (b"2", b"3")
@@ -103,7 +123,7 @@ def read_mdf(path: Path, wanted: list[str], guess: bool = False) -> tuple[dict[s
         )
     needs(f"{path}: MDF4", "asammdf")
     seconds = _TIME[0] + int(check_file(path) / _TIME[1])
-    request = {"path": str(path.absolute()), "wanted": wanted, "guess": guess, "seconds": seconds}
+    request = {"path": str(path.absolute()), "seconds": seconds, **request}
     answer = _child(json.dumps(request).encode() + b"\n", _BUSY * seconds)
     line, _, body = answer.partition(b"\n")
     try:
@@ -117,14 +137,7 @@ def read_mdf(path: Path, wanted: list[str], guess: bool = False) -> tuple[dict[s
         array = np.frombuffer(body, kind, int(np.prod(shape)), at).reshape(shape)
         at += array.nbytes
         arrays[name] = array
-    series = {
-        key: (arrays[f"t{i}"], arrays[f"v{i}"], unit, framed) for key, (i, unit, framed) in reply["series"].items()
-    }
-    parts = []
-    for i in range(reply["buses"]):
-        t, ident, bus, length, data = (arrays[f"b{i}.{k}"] for k in range(5))
-        parts.append((*in_order(str(path), t, notes := []), ident, bus, length, data, notes))  # type: ignore[var-annotated]
-    return {**{k: reply[k] for k in ("names", "comments", "why")}, "series": series}, _merge(parts)
+    return reply, arrays
 
 
 def _merge(parts: list[Any]) -> Frames | None:
@@ -188,8 +201,12 @@ def answer(request: bytes, out: BinaryIO) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     arrays: dict[str, np.ndarray] = {}
     try:
-        with asammdf.MDF(path, process_bus_logging=False) as mdf:  # type: ignore[call-arg]
-            reply = _read(mdf, asked["wanted"], asked["guess"], arrays)
+        if asked.get("record"):
+            reply = {}
+            arrays.update(zip(("us", "rows", "sent"), _record(path), strict=True))
+        else:
+            with asammdf.MDF(path, process_bus_logging=False) as mdf:  # type: ignore[call-arg]
+                reply = _read(mdf, asked["wanted"], asked["guess"], arrays)
     except MemoryError:
         reply = {
             "error": f"unpacks to more memory than its size allows, {_MEMORY[0]:,} bytes and {_MEMORY[1]} for each of "
@@ -203,6 +220,14 @@ def answer(request: bytes, out: BinaryIO) -> None:
     out.write(json.dumps(reply).encode() + b"\n")
     for a in arrays.values():
         out.write(np.ascontiguousarray(a).tobytes())
+
+
+def _record(path: str) -> FramesOfRecord:
+    """Frames of a recording, as python-can reads them."""
+    import can
+
+    with can.LogReader(path) as reader:
+        return frames_of(reader, NOTE_CHANNEL)
 
 
 def _read(mdf: Any, wanted: list[str], guess: bool, arrays: dict[str, np.ndarray]) -> dict[str, Any]:

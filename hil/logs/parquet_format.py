@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from hil.logs.table import Table, arrow_table, time_column
 from hil.logs.times import from_dates
 from vaneloop.base.files import whole
 
-__all__ = ["FRAME_COLUMNS", "open_parquet", "write_parquet"]
+__all__ = ["FRAME_COLUMNS", "open_parquet", "whole_parquet", "write_parquet"]
 
 FRAME_COLUMNS = ("time", "id", "extended", "kind", "tx", "length", "bytes")  # of a table that has a row a frame
 
@@ -24,31 +25,44 @@ _MOST_ROWS = (
 _MOST_UNPACKED = 40, 100
 
 
-def open_parquet(path: Path, options: Options) -> Source:
-    """Parquet with numeric columns; null = no sample there."""
+_DAMAGE = OSError, ValueError, OverflowError, MemoryError
+
+
+def whole_parquet(path: Path) -> Any:
+    """A Parquet file of any kind, opened (`pyarrow.parquet.ParquetFile`). Every reader of the format begins here.
+
+    Raises LogError for what is none, and for one that says that it unpacks to more than its size is worth.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     size = check_file(path)
-    damage = pa.ArrowException, OSError, ValueError, OverflowError, MemoryError
     try:
         file = pq.ParquetFile(path)
-        schema = file.schema_arrow
-    except damage as e:
+        names = file.schema_arrow.names
+    except (pa.ArrowException, *_DAMAGE) as e:
         raise LogError(f"{path}: is not a Parquet file ({str(e)[:160]})") from None
-    if again := second(schema.names):
-        raise LogError(f"{path}: column {again!r} is there more than once")
     most = _MOST_ROWS[0] + _MOST_ROWS[1] * size
     if file.metadata.num_rows > most:
         raise LogError(
             f"{path}: {size:,} bytes say that they hold {file.metadata.num_rows:,} rows; allowed: up to {most:,}"
         )
-
     unpacked = sum(file.metadata.row_group(g).total_byte_size for g in range(file.metadata.num_row_groups))
-    most = _MOST_UNPACKED[0] * len(schema.names) * (file.metadata.num_rows + 100_000) + _MOST_UNPACKED[1] * size
+    most = _MOST_UNPACKED[0] * len(names) * (file.metadata.num_rows + 100_000) + _MOST_UNPACKED[1] * size
     if unpacked > most:
         raise LogError(f"{path}: {size:,} bytes say that they unpack to {unpacked:,}; allowed: up to {most:,}")
+    return file
 
+
+def open_parquet(path: Path, options: Options) -> Source:
+    """Parquet with numeric columns; null = no sample there."""
+    import pyarrow as pa
+
+    damage = pa.ArrowException, *_DAMAGE
+    file = whole_parquet(path)
+    schema = file.schema_arrow
+    if again := second(schema.names):
+        raise LogError(f"{path}: column {again!r} is there more than once")
     time = time_column(path, list(schema.names), options)
 
     def load(key: str) -> np.ndarray:

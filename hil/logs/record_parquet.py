@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+from array import array
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ import numpy as np
 
 from hil.logs.dbc import load_dbc
 from hil.logs.frames import Frames
-from hil.logs.parquet_format import FRAME_COLUMNS
+from hil.logs.parquet_format import FRAME_COLUMNS, whole_parquet
 from hil.logs.record_formats import ERROR, EXTENDED, FD, FRAME, NOTE_KIND, REMOTE, append_whole
 from hil.logs.signals import cut_signal, select
 from hil.logs.source import LogError
@@ -158,26 +159,29 @@ class ParquetRecord:
                 writer.write_batch(batch)
 
 
+_BATCH = 1 << 16  # frames
+
+
 def read_parquet(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time (us since 1970), both words (`hil.bus.frames`) and direction of each frame of a recording."""
-    import pyarrow.parquet as pq
-
     from hil.bus.frames import NOTE
 
     names = list(FRAME_COLUMNS)
-    held = pq.ParquetFile(path).schema_arrow.names
+    file = whole_parquet(path)
+    held = file.schema_arrow.names
     if missing := [n for n in names if n not in held]:
         raise LogError(f"{path}: no column {missing[0]!r}: holds signals, not frames")
-    t = pq.read_table(path, columns=names).to_pydict()
-    us = pq.read_table(path, columns=["time"])["time"].cast("int64").to_numpy() // 1000
     flags = {"data": 0, "fd": FD << 40, "remote": REMOTE, "error": ERROR, NOTE_KIND: NOTE}
-    rows = [
-        (ident | (EXTENDED if extended and kind != "error" else 0) | flags[kind] | length << 32,
-         int.from_bytes(data[:8].ljust(8, b"\0"), "little", signed=True))
-        for ident, extended, kind, length,
-            data in zip(t["id"], t["extended"], t["kind"], t["length"], t["bytes"], strict=True)
-    ]  # fmt: skip
-    return us, np.array(rows, np.int64).reshape(-1, 2), np.array(t["tx"], bool)
+    found = array("q")
+    for batch in file.iter_batches(_BATCH, columns=names):  # as Python's numbers, of which each takes 50 bytes
+        t = batch.to_pydict()
+        us = batch.column("time").cast("int64").to_numpy() // 1000
+        rows = zip(us.tolist(), t["id"], t["extended"], t["kind"], t["tx"], t["length"], t["bytes"], strict=True)
+        for at, ident, extended, kind, tx, length, data in rows:
+            head = ident | (EXTENDED if extended and kind != "error" else 0) | flags[kind] | length << 32
+            found.extend((at, head, int.from_bytes(data[:8].ljust(8, b"\0"), "little", signed=True), bool(tx)))
+    out = np.array(found, np.int64).reshape(-1, 4)
+    return out[:, 0], out[:, 1:3], out[:, 3] != 0
 
 
 # --- the footer -------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ for a loop that must not wait for a disk; it ends the file properly even where t
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import select
 import subprocess
@@ -24,6 +25,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hil.logs.blf import whole_blf
+from hil.logs.frames import FramesOfRecord, frames_of
+from hil.logs.mdf import read_record_mdf
 from hil.logs.record_formats import (
     ERROR,
     FRAME,
@@ -160,26 +164,33 @@ class Record:
     sent: np.ndarray
 
 
+def _read_text(path: Path) -> FramesOfRecord:
+    """Frames of a text log."""
+    return frames_of(_messages(path), NOTE_NAME if path.suffix.lower() == ".log" else NOTE_CHANNEL)
+
+
+def _read_blf(path: Path) -> FramesOfRecord:
+    """Frames of a Vector binary log."""
+    import can
+
+    with can.BLFReader(io.BytesIO(whole_blf(path))) as reader:
+        return frames_of(reader, NOTE_CHANNEL)
+
+
+_READ: dict[str, Callable[[Path], FramesOfRecord]] = {
+    **dict.fromkeys((".log", ".asc", ".trc", ".csv"), _read_text), ".blf": _read_blf, ".mf4": read_record_mdf,
+    ".parquet": read_parquet,
+}  # fmt: skip
+
+
 def read_record(path: str | Path) -> Record:
     """Read what a `Recorder` wrote, or another program in a format that python-can reads. Raises LogError."""
-    from hil.bus.frames import NOTE, from_message
-
     path = Path(path)
     check_file(path)
+    if path.suffix.lower() not in _READ:
+        raise LogError(f"{path}: suffix {path.suffix!r} is not a recording's; allowed: {', '.join(_READ)}")
     try:
-        if path.suffix.lower() == ".parquet":
-            us, rows, sent = read_parquet(path)
-        else:
-            if path.suffix.lower() == ".mf4":
-                needs(f"{path}: MDF4", "asammdf")
-            own = NOTE_NAME if path.suffix.lower() == ".log" else NOTE_CHANNEL
-            found = [
-                (round(m.timestamp * 1e6), *from_message(m), not m.is_rx, m.channel == own) for m in _messages(path)
-            ]
-            us = np.array([f[0] for f in found], np.int64)
-            rows = np.array([f[1:3] for f in found], np.int64).reshape(-1, 2)
-            sent = np.array([f[3] for f in found], bool)
-            rows[np.array([f[4] for f in found], bool), 0] |= NOTE
+        us, rows, sent = _READ[path.suffix.lower()](path)
     except InputError:
         raise
     except Exception as e:  # readers meet a damaged file with any exception there is
@@ -191,7 +202,7 @@ def read_record(path: str | Path) -> Record:
 
 
 def _messages(path: Path) -> Iterator[can.Message]:
-    """Give the frames of a log. python-can takes most error frames of a candump log for data frames."""
+    """Give the frames of a text log. python-can takes most error frames of a candump log for data frames."""
     import can
 
     with can.LogReader(path) as reader:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from controller import INPUTS, Calibration, new_outputs, new_state
+from hil.logs.parquet_format import whole_parquet
 from hil.native.call import firmware
 from hil.native.program import Program
 from vaneloop.base.compiled import compiled_free
@@ -56,14 +57,12 @@ def is_crash_log(path: str | Path) -> bool:
 
 def read(path: str | Path) -> tuple[np.ndarray, dict[str, Any], Calibration]:
     """Return the inputs (float64[ticks, inputs]), what is known of the failure, and the calibration."""
-    from pyarrow import parquet
-
     try:
-        table = parquet.read_table(path)
+        table = whole_parquet(Path(path)).read()
         about = json.loads(table.schema.metadata[_KEY])
         rows = np.column_stack([table[name].to_numpy() for name in INPUTS])
         k, tables, angles = (np.array(about["calibration"][name], np.float64) for name in ("k", "table", "angles"))
-    except (OSError, ValueError, KeyError, TypeError) as e:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as e:
         raise InputError(f"{path}: is no crash log of this version ({' '.join(str(e).split())[:200]})") from None
     return np.ascontiguousarray(rows), about, Calibration(k, tables, angles)
 
