@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from vaneloop.base.cells import unmarked
 from vaneloop.base.errors import InputError
 
 __all__ = ["Source", "find", "moment", "text_table"]
@@ -124,7 +125,8 @@ def text_table(file: str, option: str) -> tuple[list[str], list[dict[str, str]]]
             rows = csv.DictReader(text, restval="", strict=True)
             have = [str(name).strip() for name in rows.fieldnames or []]
             return have, [
-                dict(zip(have, (v.strip() for v in list(row.values())[: len(have)]), strict=True)) for row in rows
+                dict(zip(have, (unmarked(v).strip() for v in list(row.values())[: len(have)]), strict=True))
+                for row in rows
             ]
     except (OSError, UnicodeDecodeError, csv.Error) as e:
         raise InputError(f"{option} {file}: cannot be read as CSV ({str(e).splitlines()[0]})") from None

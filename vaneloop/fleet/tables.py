@@ -18,6 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vaneloop.base.cells import FORMULA
 from vaneloop.base.errors import InputError
 from vaneloop.fleet.folder import KEY, STATUSES, Folder
 
@@ -186,7 +187,10 @@ def answers(folder: Folder, keys: list[str]) -> dict[str, dict[str, Any]]:
 
 
 def write_tables(db: duckdb.DuckDBPyConnection, to: str | Path, tables: tuple[str, ...] = TABLES) -> list[Path]:
-    """Write each table as Parquet and as CSV into a folder; return the files. Raises InputError."""
+    """Write each table as Parquet and as CSV into a folder; return the files. Raises InputError.
+
+    A text of the CSV that a spreadsheet would run as a formula has an apostrophe in front (`vaneloop.base.cells`).
+    """
     import duckdb
 
     out, folder = [], Path(to)
@@ -196,11 +200,22 @@ def write_tables(db: duckdb.DuckDBPyConnection, to: str | Path, tables: tuple[st
             for suffix, how in (("parquet", "FORMAT parquet, COMPRESSION zstd"), ("csv", "FORMAT csv, HEADER")):
                 file = folder / f"{table}.{suffix}"
                 temporary = folder / f".{table}.{suffix}.part"
-                db.execute(f"COPY {table} TO '{_quoted(str(temporary))}' ({how})")
+                rows = _marked(db, table) if suffix == "csv" else f"SELECT * FROM {table}"
+                db.execute(f"COPY ({rows}) TO '{_quoted(str(temporary))}' ({how})")
                 out.append(temporary.replace(file))
     except (OSError, duckdb.Error) as e:
         raise InputError(f"--tables-out {folder}: cannot be written ({str(e).splitlines()[0]})") from None
     return out
+
+
+def _marked(db: duckdb.DuckDBPyConnection, table: str) -> str:
+    """The query for a table whose texts no spreadsheet runs."""
+    columns = db.execute(f"DESCRIBE {table}").fetchall()
+    texts = [name for name, kind, *_ in columns if kind == "VARCHAR"]
+    if not texts:
+        return f"SELECT * FROM {table}"
+    of = (f'if(regexp_matches("{t}", $m$), chr(39) || "{t}", "{t}") AS "{t}"' for t in texts)
+    return f"SELECT * REPLACE ({', '.join(of)}) FROM {table}".replace("$m$", f"'{_quoted(FORMULA)}'")
 
 
 def _quoted(text: str) -> str:

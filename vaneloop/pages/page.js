@@ -38,7 +38,9 @@
     a.click();
     setTimeout(() => URL.revokeObjectURL(a.href), 1000);
   };
-  const quoted = v => /[",\n]/.test(v) ? '"' + v.replace(/"/g, '""') + '"' : v;
+  // a spreadsheet runs text that begins like this as a formula; with an apostrophe in front it does not
+  const marked = v => typeof v === "string" && /^'*[=+\-@\t\r]./s.test(v) ? "'" + v : String(v);
+  const quoted = v => /[",\r\n]/.test(v) ? '"' + v.replace(/"/g, '""') + '"' : v;
   // every line, bar or cell as a row: name, x, y and what a map's cell holds
   const csv = plot => {
     const rows = [["name", "x", "y", "value"]];
@@ -48,7 +50,7 @@
         d.z.forEach((row, i) => Array.from(row).forEach((z, j) => rows.push([d.name || "", d.x[j], d.y[i], z ?? ""])));
       } else Array.from(d.x).forEach((x, i) => rows.push([d.name || "", x, d.y[i] ?? "", ""]));
     }
-    return rows.map(r => r.map(v => quoted(String(v))).join(",")).join("\n") + "\n";
+    return rows.map(r => r.map(v => quoted(marked(v))).join(",")).join("\n") + "\n";
   };
   const name = plot => (document.title + " " + plot.id).replace(/[^A-Za-z0-9]+/g, "_");
   const button = (title, icon, click) => ({name: title, title, icon, click});

@@ -330,7 +330,9 @@ export default {
     file(suffix) { return this.src.split("/").pop() + "." + suffix; },
     csv() {
       const [a, b] = this.view || this.head.span, rows = ["channel,line,t,value"];
-      const q = (v) => (/[",]/.test(v) ? '"' + v.replace(/"/g, '""') + '"' : v);
+      // a spreadsheet runs text that begins like this as a formula; with an apostrophe in front it does not
+      const marked = (v) => (/^'*[=+\-@\t\r]./s.test(v) ? "'" + v : v);
+      const q = (v) => (/[",\r\n]/.test(v) ? '"' + marked(v).replace(/"/g, '""') + '"' : marked(v));
       this.plots.forEach((p) => this.head.panels[p.panel].lines.forEach((l, j) => p.data[0].forEach((t, k) => {
         const v = p.data[j + 1][k];
         if (!this.hidden[l.name] && t >= a && t <= b && v !== null && v !== undefined) rows.push([q(this.head.panels[p.panel].title), q(l.name), Number(t.toPrecision(12)), v].join(","));
