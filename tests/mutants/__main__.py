@@ -77,7 +77,7 @@ TARGETS: tuple[Target, ...] = (
 NEAREST = {
     "controller": "records_spec controller xcp tables c_reference node",
     "plant": (
-        "plant effects effects_reference linkage electromechanical machines tables tolerances lanes "
+        "plant_spec plant effects effects_reference linkage electromechanical machines tables tolerances lanes "
         "curve_lanes spatial fmu"
     ),
     "plant.stages": "stages_spec curve_lanes same_answer lanes effects machines electromechanical loggers",
