@@ -163,6 +163,10 @@ def test_the_stroke_starts_where_it_was_seen_only_with_a_window() -> None:
     assert run(p, 5, lvdt=stroke)[0, 0] == pytest.approx(0.030, abs=1e-12)
     free = run(p, lvdt=stroke)[0, 0]
     assert free == run(p)[0, 0] and abs(free - 0.024) < 1e-6
+    i, n_r, p_s, t_oil = log()
+    out = np.full((12, 1), np.nan)
+    actuator_run(i, n_r, p_s, t_oil, 8e-3, p, shipped().start(0.024, 60.0), out)
+    assert out[0, 0] == free
 
 
 @pytest.mark.parametrize("table", [HYDRAULIC, MOTOR])

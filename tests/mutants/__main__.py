@@ -119,7 +119,7 @@ NEAREST = {
         "learn_turns"
     ),
     "vaneloop.verbs": (
-        "verbs parts held long_logs guess starts spikes doubts machines learn_two own_laws your_own_model "
+        "verbs_spec verbs parts held long_logs guess starts spikes doubts machines learn_two own_laws your_own_model "
         "search_commands trust latest"
     ),
     "vaneloop.cli": (

@@ -1,0 +1,760 @@
+"""Verbs by their specification: parts and records of logs, long logs, law files, what is refused, what answers hold."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.logs import Channel, Log, LogError
+from plant import Model, write_model
+from plant.model import Learned as Table
+from vaneloop.base.errors import InputError
+from vaneloop.base.spans import Span
+from vaneloop.discrepancy import Record, StageError, System
+from vaneloop.discrepancy.models.tried import Outcome
+from vaneloop.discrepancy.stage import Effect, Parameter, Stage
+from vaneloop.discrepancy.whole import BLOCKS, Failing, Sums
+from vaneloop.verbs import learn, long, parts, search
+from vaneloop.verbs.long import Held, Whole
+from vaneloop.verbs.machine import TABLES, Machine, files_of
+
+# ---- parts of logs ---------------------------------------------------------------------------------------------------
+
+T = np.arange(11) * 1.0
+
+
+def record(**columns: Any) -> Record:
+    """Eleven samples, a second apart, that begin at 3 s."""
+    return Record("r", T + 3.0, {"y": T * 2.0, "constant": np.array([7.0])} | columns, 100.0)
+
+
+def test_what_is_fitted_and_what_tests_are_told_apart() -> None:
+    a, b = Span(0.0, 5.0), Span(5.0, 9.0)
+    assert parts.split("0:5", "5:9") == ([a], [b], []) and parts.split((0, 5), [(5, 9), "x.csv"]) == (
+        [a],
+        [b],
+        ["x.csv"],
+    )
+    assert parts.split((), ["x.csv", "y.csv"]) == ([], [], ["x.csv", "y.csv"])
+    assert parts.split((), "x.csv") == ([], [], ["x.csv"]) and parts.split((), ()) == ([], [], [])
+    one = record()
+    assert parts.split((), one) == ([], [], [one])
+    with pytest.raises(InputError, match="parts must not overlap"):
+        parts.split("0:6", "5:9")
+
+
+def test_a_part_of_a_record_is_one_of_its_own() -> None:
+    whole = record()
+    assert parts.records_of(whole, []) == [whole]
+    first, second = parts.records_of(whole, [Span(-math.inf, 5.0), Span(5.0, 8.0)])
+    assert first.name == "r :5" and first.t.tolist() == [3.0, 4.0] and first.begin == 100.0
+    assert second.t.tolist() == [5.0, 6.0, 7.0] and second.columns["y"].tolist() == [4.0, 6.0, 8.0]
+    assert second.begin == 102.0 and second.columns["constant"].tolist() == [7.0]
+    for span, count in ((Span(5.0, 6.0), 1), (Span(50.0, 60.0), 0)):
+        with pytest.raises(InputError, match=rf"r: {count} samples in '.*'; the log is from 3 to 13 s"):
+            parts.records_of(whole, [span])
+    assert len(parts.records_of(whole, [Span(5.0, 6.5)])[0].t) == 2
+
+
+def test_a_part_of_a_log_has_its_channels_that_have_two_samples_there() -> None:
+    log = Log("a.csv", {"n_dem": Channel(T, 60.0 + T), "p_s": Channel(T[::5], 20.0 + T[::5], framed=True)})
+    assert parts.part_of(log, []) is log
+    part = parts.part_of(log, [Span(0.0, 2.0), Span(4.0, 6.0)])
+    assert part.channels["n_dem"].t.tolist() == [0.0, 1.0, 4.0, 5.0] and part.path == "a.csv"
+    assert part.channels["n_dem"].values.tolist() == [60.0, 61.0, 64.0, 65.0]
+    assert part.channels["p_s"].t.tolist() == [0.0, 5.0] and part.channels["p_s"].framed
+    assert list(parts.part_of(log, [Span(4.0, 9.0)]).channels) == ["n_dem"]  # one sample is none
+    with pytest.raises(InputError, match="a.csv: 1 samples in '4:5'; the log is from 0 to 10 s"):
+        parts.part_of(log, [Span(0.0, 3.0), Span(4.0, 5.0)])
+
+
+def test_stages_of_the_parts_that_test_stand_beside_those_that_are_fitted() -> None:
+    log = Log("a.csv", {"n_dem": Channel(T, 60.0 + T)})
+    machine: Any = SimpleNamespace(bind=lambda part: SimpleNamespace(of=part, test=None))
+    fitted = parts.bind_parts(machine, log, [Span(0.0, 5.0)], [Span(5.0, 9.0)])
+    assert fitted.of.channels["n_dem"].t[-1] == 4.0 and fitted.test.of.channels["n_dem"].t.tolist() == [
+        5.0,
+        6.0,
+        7.0,
+        8.0,
+    ]
+    assert parts.bind_parts(machine, log, [], []).test is None
+
+
+def stage(name: str, outputs: tuple[str, ...] = ("y",), **more: Any) -> Stage:
+    """A stage whose outputs are its first parameter plus its effect's."""
+    measured = np.array([10.0 + T * 0.0 for _ in outputs])
+    parameters = (Parameter("k", 1.0, "-", tolerance=9.0), Parameter(f"of_{name}", 0.0, "-", tolerance=9.0))
+    effect = Effect("bend", (Parameter("size", 0.0, "mm", -9.0, 9.0),), ((1.0,),))
+
+    def run(thetas: np.ndarray) -> np.ndarray:
+        return np.repeat((thetas[:, :1] + thetas[:, 2:3])[:, :, None] * np.ones(len(T)), len(outputs), axis=1)
+
+    given = {"name": name, "outputs": outputs, "units": ("mm",) * len(outputs), "parameters": parameters,
+             "effects": (effect,), "run": run, "t": T, "measured": measured, "window": None,
+             "floor": np.full(len(outputs), 0.5)}  # fmt: skip
+    return Stage(**(given | more))
+
+
+def fit(k: float, size: float) -> Any:
+    """Parameters as they were fitted."""
+    return SimpleNamespace(theta=np.array([k, 5.0, size]))
+
+
+def test_fits_are_held_against_the_part_that_they_have_not_seen() -> None:
+    measured = np.array([np.where(np.arange(11) < 3, np.nan, 10.0), np.full(11, 12.0)])
+    chain: Any = SimpleNamespace(stages=[stage("a", ("y", "z")), stage("b")], test=None)
+    fits = [("a", fit(7.0, 0.0), fit(7.0, 2.0)), ("b", fit(1.0, 0.0), fit(1.0, 0.0))]
+    assert parts.tested(chain, fits) == [] and parts.tested(SimpleNamespace(stages=[]), fits) == []
+    chain.test = SimpleNamespace(stages=[stage("a", ("y", "z"), measured=measured)], whole=None)
+    y, z = parts.tested(chain, fits)  # the log shows no stage b there
+    assert (y.stage, y.signal, y.unit, y.samples, y.noise_floor) == ("a", "y", "mm", 8, 0.5)
+    assert (y.error_before, y.error_after) == (pytest.approx(3.0), pytest.approx(1.0))
+    assert (z.error_before, z.error_after, z.samples) == (pytest.approx(5.0), pytest.approx(3.0), 11)
+
+
+def test_parameters_are_carried_by_their_names() -> None:
+    here, there = stage("a"), stage("b")
+    assert parts.carried(here, np.array([7.0, 5.0, 2.0]), there).tolist() == [7.0, 0.0, 2.0]
+    other = replace(there, effects=(replace(there.effects[0], name="other"),))
+    assert parts.carried(here, np.array([7.0, 5.0, 2.0]), other).tolist() == [7.0, 0.0, 0.0]
+
+
+# ---- records of systems ----------------------------------------------------------------------------------------------
+
+
+def system(**more: Any) -> System:
+    """A system of one input and two outputs."""
+    given = {"name": "pump", "kind": "static", "model": lambda u, p: (u.u, u.u), "inputs": {"u": "V"},
+             "outputs": {"y": "mm", "z": "mm"}}  # fmt: skip
+    return System(**(given | more))
+
+
+def test_a_log_of_a_system_is_on_the_raster_of_its_output_with_most_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow, fine = np.arange(6) * 0.2, np.arange(21) * 0.05
+    gap = fine[(fine < 0.3) | (fine > 0.62)]
+    log = SimpleNamespace(notes=["read"], channels={
+        "u": Channel(slow, slow, framed=True), "y": Channel(fine, fine**2), "z": Channel(gap, 2.0 * gap),
+        "one": Channel(np.array([0.5]), np.array([3.0])),
+    })  # fmt: skip
+    asked: list[Any] = []
+    monkeypatch.setattr("hil.logs.read_log", lambda path, **how: asked.append((path, how)) or log)
+    found, notes = parts.read_record("logs/r.csv", system(), design_rpm=5000.0)
+    signals = {"u": "V", "y": "mm", "z": "mm"}
+    assert asked == [("logs/r.csv", {"design_rpm": 5000.0, "require": list(signals), "signals": signals})]
+    assert (found.name, found.begin, notes) == ("r.csv", 0.0, ["r.csv: read"]) and found.t == pytest.approx(fine)
+    assert found.columns["u"] == pytest.approx(fine) and found.columns["y"] == pytest.approx(fine**2)
+    assert found.columns["one"].tolist() == [3.0] * 21
+    z = found.columns["z"]
+    far = np.array([min(abs(gap - t)) > 0.075 for t in fine])
+    assert np.isnan(z[far]).all() and z[~far] == pytest.approx(2.0 * fine[~far]) and far.sum() == 5
+    simulated = system(kind="simulate", states={"y": "mm", "z": "mm"}, model=lambda x, u, p: (u.u, u.u))
+    held = parts.read_record("r.csv", simulated)[0].columns["u"]  # a value holds from its frame on
+    assert held == pytest.approx(np.floor(fine / 0.2 + 1e-9) * 0.2)
+    log.channels["u"] = replace(log.channels["u"], framed=False)
+    assert parts.read_record("r.csv", simulated)[0].columns["u"] == pytest.approx(fine)
+
+
+def test_a_system_s_own_reader_is_asked_and_its_complaints_told(tmp_path: Path) -> None:
+    at = tmp_path / "x.bin"
+    at.write_text("data")
+    read = {"t": [0.0, 1.0], "u": [1, 2], 3: np.array([4.0, 5.0])}
+    found, notes = parts.read_record(at, system(read=lambda path: read if path == str(at) else None))
+    assert found.t.tolist() == [0.0, 1.0] and found.columns["u"].dtype == float and "3" in found.columns and notes == []
+    with pytest.raises(StageError, match="no such file"):
+        parts.read_record(tmp_path / "none", system(read=lambda _: read))
+    for made, says in (
+        (lambda _: 1 / 0, r"read\(\) of system 'pump' failed: ZeroDivisionError: division by zero"),
+        (lambda _: {"u": [1.0]}, "returned u; a time 't' is needed"), (lambda _: {}, "returned nothing; a time"),
+        (lambda _: {"t": ["a"]}, "not numbers"),
+    ):  # fmt: skip
+        with pytest.raises(StageError, match=says):
+            parts.read_record(at, system(read=made))
+
+
+# ---- long logs -------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Grid:
+    """A raster: a row a tenth of a second, ten to a second's window."""
+
+    start: float = 50.0
+    dt: float = 0.1
+    rows: int = 0
+    window: int = 10
+
+
+PIECE_ROWS = 600  # of 60 s
+
+
+@dataclass
+class Stages:
+    """Stands for the stages of some rows."""
+
+    rows: list[tuple[int, int]]
+    draws: Any = None
+    notes: tuple[str, ...] = ("own",)
+    whole: Any = None
+    stages: Any = ()
+    test: Any = None
+
+
+def whole_of(pieces: float, channels: dict[str, Channel] | None = None, chosen: Sequence[int] = ()) -> Whole:
+    """A long log of so many pieces of 60 s."""
+    log: Any = SimpleNamespace(channels=channels or {})
+    bind: Any = lambda rows, draws=None: Stages(rows, draws)  # noqa: E731
+    grid: Any = Grid(rows=int(pieces * PIECE_ROWS))
+    return Whole(log, grid, bind, tuple(chosen))
+
+
+def test_pieces_of_a_long_log_are_a_minute() -> None:
+    assert (long.LONG, long.FITTED, long.PIECE, long.STRETCH, long.LEAD) == (360_000, 120_000, 60.0, 16, 30.0)
+    whole = whole_of(7.5)
+    assert (whole.rows, whole.pieces) == (PIECE_ROWS, 7)
+    assert [whole.time(k) for k in (0, 2, 7, 8)] == pytest.approx([50.0, 170.0, 470.0, 500.0])
+    chain: Any = whole.chain((0, 1, 4, 7))
+    assert chain.rows == [(0, 1200), (2400, 3000), (4200, 4500)]  # what follows one another is one; the last is short
+    assert chain.whole.chosen == (0, 1, 4, 7)
+    assert chain.notes[0].startswith("a long log: 240 s of 450 are fitted, pieces of 60 s") and chain.notes[1] == "own"
+    more: Any = chain.whole.with_more([5, 1])
+    assert more.rows == [(0, 1200), (2400, 3600), (4200, 4500)] and more.whole.chosen == (0, 1, 4, 5, 7)
+    doubled: Any = whole.changed(lambda c: replace(c, notes=("changed",)) if isinstance(c, Stages) else c).chain((2,))
+    assert doubled.notes[1] == "changed" and doubled.rows == [(1200, 1800)]
+
+
+def test_runs_are_joined_where_they_touch() -> None:
+    assert long._runs([(0, 1), (1, 2), (3, 4), (4, 6), (7, 8)]) == [(0, 2), (3, 6), (7, 8)] and long._runs([]) == []
+
+
+def at_levels(levels: Sequence[float], **more: Sequence[float]) -> dict[str, Channel]:
+    """Channels that stay for 60 s at each level."""
+    t = 50.0 + np.arange(len(levels) * 600) * 0.1
+    return {n: Channel(t, np.repeat(np.asarray(v, dtype=float), 600)) for n, v in {"n_r": levels, **more}.items()}
+
+
+def test_what_a_piece_visits_is_counted_by_condition_and_direction() -> None:
+    channels = at_levels([0.0, 8.0, 4.0]) | {"state": Channel(np.array([50.0, 51.0]), np.array([1.0, 2.0]))}
+    channels["one"] = Channel(np.array([50.0]), np.array([1.0]))
+    visits = long._visits(whole_of(3, channels))
+    assert visits.shape == (3, 24) and visits.sum(axis=1).tolist() == [600.0] * 3
+    for piece, bin_ in enumerate((0, 7, 4)):
+        assert visits[piece, 3 * bin_ + 1] >= 595.0  # at rest; a bin has its lower end, the last its upper too
+    assert long._visits(whole_of(3)).tolist() == [[0.0]] * 3
+    assert long._visits(whole_of(3, at_levels([5.0, 5.0, 5.0]))).tolist() == [[0.0]] * 3
+
+
+@pytest.mark.parametrize("speed, direction", [(0.3, 2), (-0.3, 0), (0.15, 1), (0.0, 1)])
+def test_a_stroke_that_moves_faster_than_a_fifth_of_a_millimetre_a_second_has_a_direction(
+    speed: float, direction: int
+) -> None:
+    t = 50.0 + np.arange(600) * 0.1
+    channels = {"x_lvdt": Channel(t, 10.0 + speed * t), "n_r": Channel(t, np.linspace(0.0, 1.0, 600))}
+    visits = long._visits(whole_of(1, channels)).reshape(-1, 8, 3)
+    assert visits[..., direction].sum() == visits.sum() and len(visits) == (3 if speed else 1)
+    only = {"x_dem": channels["x_lvdt"], "n_r": channels["n_r"]}  # without a measured stroke the demanded one
+    assert long._visits(whole_of(1, only)).reshape(-1, 8, 3)[..., direction].sum() == visits.sum()
+
+
+def test_pieces_are_added_until_every_visited_bin_is_in() -> None:
+    levels = [0.0, 0.0, 8.0, 0.0, 4.0, 4.0]
+    whole = whole_of(6, at_levels(levels))
+    assert long._everywhere(whole, [0]) == [0, 2, 4]
+    assert long._everywhere(whole, [0, 5]) == [0, 2, 5] and long._everywhere(whole, [0, 2, 4]) == [0, 2, 4]
+    channels = at_levels([0.0] * 4)
+    channels["n_r"].values[610:635] = 8.0  # 2.5 s: too short to count as visited
+    assert long._everywhere(whole_of(4, channels), [0]) == [0]
+    channels["n_r"].values[610:645] = 8.0
+    assert long._everywhere(whole_of(4, channels), [0]) == [0, 1]
+
+
+def test_an_excerpt_has_half_its_pieces_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(long, "spread", lambda pieces, many, _: asked.append((pieces, many)) or [0])
+    machine: Any = SimpleNamespace(stages_of=lambda log, grid, rows: Stages(rows))
+    whole = whole_of(9, at_levels([0.0] * 9))
+    for fitted, many in ((3000, 5), (600, 2), (0, 2), (3599, 5)):
+        chain: Any = long.excerpted(whole.log, whole.grid, machine, fitted)
+        assert asked.pop() == (9, many) and chain.rows == [(0, 600)] and chain.whole.chosen == (0,)
+
+
+def sums(name: str, hot: Sequence[int], pieces: int, first: int = 0, outputs: tuple[str, ...] = ("y",)) -> Sums:
+    """Sums of a stage whose last parameter set fails in the ``hot`` pieces."""
+    n = np.full((len(outputs), pieces * BLOCKS), 100.0)
+    squares = np.repeat(n[None], 2, axis=0).copy()
+    for piece in hot:
+        squares[1, 0, piece * BLOCKS : (piece + 1) * BLOCKS] = 900.0 + 100.0 * piece
+    return Sums(name, outputs, ("mm",) * len(outputs), np.full(len(outputs), 0.5), first, n, n.copy(), squares, False)
+
+
+def test_a_log_is_held_stretch_by_stretch_and_what_fails_told_by_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    pieces = 2 * long.STRETCH + 3
+    asked: list[int] = []
+
+    def stretch(k: int) -> list[Sums]:
+        asked.append(k)
+        (whole, chain, fits), *_ = long._WORK
+        assert whole.pieces == pieces and chain is held_chain and list(fits) == ["a", "b"]
+        assert fits["a"][0].tolist() == [[1.0], [2.0]] and fits["a"][1].tolist() == [0.5]
+        here = long.STRETCH if k < 2 else 4
+        hot = {0: [2, 3, 7], 2: [1]}.get(k, [])
+        return [sums("a", hot, here, k * long.STRETCH * BLOCKS), sums("b", [], here, k * long.STRETCH * BLOCKS)]
+
+    monkeypatch.setattr(long, "_stretch", stretch)
+    held_chain: Any = SimpleNamespace(whole=whole_of(pieces + 0.5, chosen=(0, 1, 5)))
+    told: list[float] = []
+    fits = [(n, [np.array([1.0]), np.array([2.0])], np.array([0.5]), 1.0) for n in ("a", "b")]
+    held = long.held_against(held_chain, fits, workers=1, progress=told.append)
+    assert asked == [0, 1, 2] and told == pytest.approx([1 / 3, 2 / 3, 1.0]) and long._WORK == []
+    assert [(f.stage, f.signal, f.unit, f.low, f.high) for f in held.failing] == [
+        ("a", "y", "mm", 170.0, 290.0), ("a", "y", "mm", 470.0, 530.0), ("a", "y", "mm", 2030.0, 2090.0),
+    ]  # fmt: skip
+    assert held.failing[0].ratio == pytest.approx(math.sqrt((11.0 + 12.0) / 2.0))
+    assert held.failing[0].error == pytest.approx(0.5 * held.failing[0].ratio)
+    assert held.pieces == (7, 3, 2, 2 * long.STRETCH + 1)  # the worst first
+    assert held.fitted == [(50.0, 170.0), (350.0, 410.0)] and set(held.sums) == {"a", "b"}
+    assert held.of("a") == held.failing and held.of("b") == []
+    assert held.json()["fitted_s"] == held.fitted and held.json()["failing"][0]["low"] == 170.0
+
+
+def test_a_stretch_is_simulated_with_what_leads_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = whole_of(20)
+    asked: list[Any] = []
+
+    def bind(rows: Any, draws: Any) -> Any:
+        asked.append((rows, draws))
+        if rows[0][0] == 0 and len(asked) > 1:
+            raise LogError("nothing can be judged")
+        return SimpleNamespace(stages=[stage("a", ("z",)), stage("not asked")])
+
+    made: list[Any] = []
+    monkeypatch.setattr(long, "sums_of", lambda *a: made.append(a) or "sums")
+    chain: Any = SimpleNamespace(stage=lambda name: stage(name, ("y", "z")))
+    thetas = np.array([[7.0, 5.0, 2.0]])
+    long._WORK[:] = [(replace(whole, bind=bind), chain, {"a": (thetas, np.array([0.25, 0.75]))})]
+    assert long._stretch(1) == ["sums"]
+    assert asked == [([(9600 - 300, 12_000)], long.ONE_DRAW)]
+    of, floor, moved, first, behind, block = made[0]
+    assert of.name == "a" and floor.tolist() == [0.75] == of.floor.tolist() and moved.tolist() == [[7.0, 5.0, 2.0]]
+    assert (first, behind, block) == (96, 120, 100)
+    assert long._stretch(0) == [] and asked[1][0] == [(0, 9600)]
+    long._WORK.clear()
+
+
+def test_a_search_goes_on_once_where_the_whole_log_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen: list[tuple[int, ...]] = []
+    told: list[float] = []
+    words: list[Any] = []
+    weighed: list[Any] = []
+
+    def found(stages: Any, not_observed: Any, _: Any, workers: int, news: Any) -> Any:
+        chosen.append(stages)
+        news(SimpleNamespace(fraction=0.5, text="tries", found="f"))
+        return Found(["stage"])
+
+    @dataclass
+    class Found:
+        stages: list[Any]
+        verdict: str = "first"
+        elapsed_s: float = -1.0
+
+    def held(chain: Any, stages: Any, workers: int, progress: Any) -> Any:
+        progress(0.5)
+        return SimpleNamespace(pieces=tuple(range(3, 30)), sums={})
+
+    class Excerpt:
+        def __init__(self, pieces: tuple[int, ...]):
+            self.stages, self.not_observed = pieces, {}
+            self.whole = SimpleNamespace(chosen=pieces, with_more=lambda new: Excerpt((*pieces, *new)))
+
+    monkeypatch.setattr(long, "search", found)
+    monkeypatch.setattr(long, "_held", held)
+    monkeypatch.setattr(long, "_of_all", lambda held, stages: [f"all {s}" for s in stages])
+    monkeypatch.setattr(long, "weigh", weighed.append)
+    monkeypatch.setattr(long, "verdict_of", lambda stages: f"verdict of {stages}")
+    chain, d, _ = long.searched(Excerpt((3, 9)), 2, told.append, words.append)
+    new = tuple(k for k in range(3, 30) if k not in (3, 9))[: long.MORE]
+    assert chosen == [(3, 9), (3, 9, *new)] and chain.stages == chosen[1]
+    assert told == pytest.approx([0.15, 0.4, 0.65, 0.9]) and [n.fraction for n in words] == pytest.approx(told)
+    assert words[0].text == "tries" and words[0].found == "f" and words[1].text == "held against the whole log"
+    assert (
+        d.stages == ["all stage"] == weighed and d.verdict == "verdict of ['all stage']" and 0.0 <= d.elapsed_s < 60.0
+    )
+    chosen.clear()
+    long.searched(Excerpt(tuple(range(40))))
+    assert len(chosen) == 1  # nothing new fails
+
+
+def test_all_of_a_log_answers_for_its_excerpt(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    held = SimpleNamespace(sums={"a": "sums of a"}, of=lambda name: f"fails of {name}")
+    monkeypatch.setattr(long, "held_against", lambda *a: asked.append(a) or held)
+    monkeypatch.setattr(long, "of_whole", lambda *a: a)
+    a, b = (SimpleNamespace(stage=n, base=fit(1.0, 0.0), final=fit(2.0, 1.0), floor=0.5, excess=3.0) for n in "ab")
+    chain: Any = object()
+    results, found = long.held_results(chain, [a, b])  # type: ignore[list-item]
+    assert found is held and results == [(a, "sums of a", "fails of a"), b]
+    ((of, fits, workers, progress),) = asked
+    assert of is chain and workers == 2 and progress is None
+    assert [(n, t[0].tolist(), t[1].tolist(), floor, left) for n, t, floor, left in fits] == [
+        (n, [1.0, 5.0, 0.0], [2.0, 5.0, 1.0], 0.5, 9.0) for n in "ab"
+    ]
+
+
+def test_a_change_reaches_the_test_and_the_whole_log() -> None:
+    change = lambda c: replace(c, notes=("changed",))  # noqa: E731
+    bare: Any = long.changed(Stages([]), change)  # type: ignore[arg-type]
+    assert bare.notes == ("changed",) and bare.whole is None and bare.test is None
+    full: Any = long.changed(Stages([], whole=whole_of(3), test=Stages([])), change)  # type: ignore[arg-type]
+    assert full.test.notes == ("changed",) and full.whole.bind([(0, 1)]).notes == ("changed",)
+
+
+# ---- tables of a machine ---------------------------------------------------------------------------------------------
+
+
+def test_tables_come_from_the_folder_where_it_has_them(tmp_path: Path) -> None:
+    shipped = {name: f"{name}.toml" for name in TABLES}
+    assert files_of(None) == shipped and files_of(None, "p.toml") == shipped | {"plant": "p.toml"}
+    with pytest.raises(InputError, match="is not a folder"):
+        files_of(tmp_path / "none")
+    with pytest.raises(InputError, match=r"holds none of calibration.toml, .*plant.toml"):
+        files_of(tmp_path)
+    (tmp_path / "own_calibration.toml").write_text("")
+    assert files_of(tmp_path) == shipped
+    (tmp_path / "schedules.toml").write_text("")
+    assert files_of(tmp_path) == shipped | {"schedules": str(tmp_path / "schedules.toml")}
+
+
+@pytest.mark.parametrize("rows, excerpt", [(long.LONG, False), (long.LONG + 1, True)])
+def test_a_log_of_more_than_an_hour_is_fitted_on_an_excerpt(
+    rows: int, excerpt: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vaneloop.discrepancy.models.vane_stages.raster.grid_of", lambda log: Grid(rows=rows))
+    monkeypatch.setattr(long, "excerpted", lambda log, grid, machine: "excerpt")
+    monkeypatch.setattr(Machine, "stages_of", lambda self, log, grid: "all")
+    log: Any = None
+    assert Machine().bind(log) == ("excerpt" if excerpt else "all")
+
+
+# ---- learned laws ----------------------------------------------------------------------------------------------------
+
+
+PLACES = np.arange(257.0)
+
+
+def law(name: str = "bend", **more: Any) -> Any:
+    """A law that was learned."""
+    given = {
+        "name": name, "how": "adds", "at": "valve.current", "of": "n_r", "unit": "mA", "of_unit": "%", "spoken": None,
+        "x": PLACES, "y": PLACES * 2.0, "low": PLACES - 1.0, "high": PLACES + 1.0,
+        "visited": np.array([0.25, 0.75]), "error_before": 4.0, "error_after": 1.5, "formulas": [], "untold": (),
+        "trades": [], "rivals": [], "knots": np.array([0.0] * 4 + [256.0] * 4), "reach": (0.0, 300.0),
+        "more": dict, "axis": lambda: None, "sentence": lambda: f"{name} is added",
+        "range_note": lambda: f"{name}: range", "of_the_kind_of": lambda other: other.name == name,
+    }  # fmt: skip
+    return SimpleNamespace(**(given | more))
+
+
+def test_a_law_as_json_has_33_places() -> None:
+    formula = SimpleNamespace(form="line", text="a q", numbers={"a": 2.0}, error=1.0, law="spring", more=9)
+    said = learn.law_json(law(formulas=[formula], untold=(0,), trades=["k"], rivals=["r"], more=lambda: {"z": 1}))
+    assert len(said["x"]) == 33 and said["x"][:2] == [0.0, 8.0] and said["x"][-1] == 256.0 and said["y"][1] == 16.0
+    assert (said["low"][1], said["high"][1], said["visited"]) == (7.0, 9.0, [0.25, 0.75]) and said["effect"] == "bend"
+    assert said["formulas"] == [{"form": "line", "text": "a q", "numbers": {"a": 2.0}, "error": 1.0, "law": "spring"}]
+    assert said["untold"] == (0,) and said["z"] == 1 and said["error_before"] == 4.0
+
+
+def answer(verdict: str, laws: Sequence[Any] = (), **more: Any) -> Any:
+    """An answer of ``learn``."""
+    diagnosed: Any = SimpleNamespace(effects=["valve_lag"])
+    outcome = Outcome(verdict, nearest=["near"], why="why", notes=["note"])
+    return learn.Learned(diagnosed, outcome, list(laws), log="a.csv", **more)
+
+
+def test_an_answer_of_learn_in_words() -> None:
+    assert answer("none").sentence() == "Nothing is missing: why."
+    assert answer("named").sentence() == "Laws with names say it: why."
+    assert answer("unknown").sentence() == "No honest law of one quantity or two is there: why."
+    assert answer("unknown", steps={"x_lvdt": 0.1}).sentence() == "A reading lacks bits: why."
+    assert answer("named", steps={"x_lvdt": 0.1}).sentence() == "Laws with names say it: why."
+    two = answer("learned", [law("one"), law("two", error_before=9.0, error_after=1.25)])
+    assert two.sentence().startswith("One is added; two is added. Held-out error in noise floors: 4")
+    assert "1.25" in two.sentence() and "9" not in two.sentence().split("floors:")[1]
+    said = answer("learned", [law()], path="m.toml").to_dict()
+    assert (said["log"], said["verdict"], said["model"], said["named"]) == ("a.csv", "learned", "m.toml", ["valve_lag"])
+    assert len(said["laws"]) == 1 and said["nearest"] == ["near"] and said["schema"] == 1
+    assert "steps" not in said and "logs" not in said
+    by_log: Any = SimpleNamespace(json=lambda: {"logs": [1, 2], "more": 3})
+    said = answer("learned", [law()], by_log=by_log, steps={"x_lvdt": 0.1}).to_dict()
+    assert said["logs"] == [1, 2] and said["steps"] == {"x_lvdt": 0.1} and "more" not in said
+
+
+def test_notes_of_learned_laws() -> None:
+    laws = [law("a"), law("b", untold=(0, 1), trades=["k", "l"], rivals=["c", "d"]), law("c", untold=(1,))]
+    assert answer("learned", laws).notes == [
+        "note", "a: range", "b: its mean and slope cannot be told from these logs; it trades with k, l",
+        "b: as good: c, d", "b: range", "c: its slope cannot be told from these logs", "c: range",
+    ]  # fmt: skip
+
+
+def test_shapes_of_curves_that_go_together() -> None:
+    assert learn.checked_shape(["zero", "odd", "zero"]) == ("zero", "odd") and learn.checked_shape([]) == ()
+    for one in ("odd", "rising", "falling"):
+        assert learn.checked_shape([one]) == (one,)
+    with pytest.raises(InputError, match=r"shape \(='round'\): allowed: .*odd"):
+        learn.checked_shape(["round"])
+    with pytest.raises(InputError, match=r"shape \(=falling, zero, odd\): of odd and falling one is allowed"):
+        learn.checked_shape(["falling", "zero", "odd"])
+
+
+KNOTS = [0.0] * 4 + [100.0] * 4
+CURVE = Table(how="adds", at="valve.current", of="n_r", low=0.0, high=100.0, values=[1.0, 2.0, 3.0, 4.0], knots=KNOTS)
+
+
+def test_law_files_are_added_by_their_names(tmp_path: Path) -> None:
+    write_model(tmp_path / "law.toml", Model(curves={"bend": CURVE}, effects={"bend": {"c1": 0.5}}))
+    write_model(tmp_path / "other.toml", Model())
+    machine = Machine(model=Model(effects={"lvdt_bias": {"bias": 0.1}}))
+    wanted, model = learn.with_law_files(["valve_lag", str(tmp_path / "law.toml")], machine)
+    assert wanted == ["valve_lag", "bend"] and model.curves == {"bend": CURVE}
+    assert model.effects == {"lvdt_bias": {"bias": 0.1}, "bend": {"c1": 0.5}}
+    assert learn.with_law_files(["valve_lag"], machine) == (["valve_lag"], machine.added)
+    with pytest.raises(InputError, match="has no table curves; allowed: a law file of vaneloop learn"):
+        learn.with_law_files([str(tmp_path / "other.toml")], machine)
+
+
+def tried(size: float = 2.0, jump: bool = False) -> Any:
+    """A curve that was fitted."""
+    candidate = SimpleNamespace(
+        name="own name", size=np.float64(size), jump=jump, coefficients=lambda theta: 10.0 * np.asarray(theta)
+    )
+    judge = SimpleNamespace(stage=SimpleNamespace(index=lambda: {"own name": slice(1, 5)}))
+    return SimpleNamespace(candidate=candidate, judge=judge, fit=SimpleNamespace(theta=np.arange(6.0)))
+
+
+def test_laws_become_a_model_file_s_curves() -> None:
+    formula = SimpleNamespace(form="line", numbers={"a": 3.0})
+    laws = [law("splines"), law("spoken", spoken=formula)]
+    outcome: Any = SimpleNamespace(tried=[tried(), tried(4.0)])
+    before = Model(effects={"lvdt_bias": {"bias": 0.1}}, curves={"old": CURVE})
+    model = learn._as_model(before, outcome, laws, outcome.tried[1])
+    assert list(model.curves) == ["old", "splines", "spoken"] and list(before.curves) == ["old"]
+    splines, spoken = model.curves["splines"], model.curves["spoken"]
+    assert splines.values == [10.0, 20.0, 30.0, 40.0] and splines.knots == [0.0] * 4 + [256.0] * 4 and not splines.jump
+    assert (splines.low, splines.high, splines.size, splines.unit, splines.form) == (0.0, 256.0, 2.0, "mA", "")
+    assert model.effects["splines"] == {"c1": 10.0, "c2": 20.0, "c3": 30.0, "c4": 40.0}
+    assert (spoken.form, spoken.values, spoken.reach, spoken.size) == ("line", [3.0], [0.0, 300.0], 4.0)
+    assert (spoken.low, spoken.high, spoken.knots) == (0.0, 256.0, [])
+    assert model.effects["spoken"] == {"a": 3.0} and model.effects["lvdt_bias"] == {"bias": 0.1}
+
+
+def test_without_a_curve_the_others_are_fitted_from_where_they_are() -> None:
+    fits: list[Any] = []
+    index = {"a": slice(0, 2), "b": slice(2, 4)}
+    of = SimpleNamespace(index=lambda: index, neutral=lambda: np.full(4, 9.0))
+    judge: Any = SimpleNamespace(stage=of, fit=lambda names, theta: fits.append((names, theta.tolist())) or "fit")
+    theta = np.arange(4.0)
+    at: Any = SimpleNamespace(theta=theta)
+    assert learn._without(judge, at, ("a", "b"), "b") == "fit" and fits == [(("a",), [0.0, 1.0, 9.0, 9.0])]
+    assert learn._without(judge, at, ("a",), "a") is None and theta.tolist() == [0.0, 1.0, 2.0, 3.0] and len(fits) == 1
+
+
+def test_which_stages_are_asked_for_laws(monkeypatch: pytest.MonkeyPatch) -> None:
+    noisy: list[bool] = []
+    monkeypatch.setattr("vaneloop.discrepancy.models.at_the_noise.above_the_noise", lambda judge, base: noisy[-1])
+    monkeypatch.setattr("vaneloop.discrepancy.fit.Judge", lambda stage, floor: None)
+    for made, verdict, above, asked in (
+        ("x", "missing", True, False), ("x", "unknown", False, True), ("x", "none", True, True),
+        ("x", "none", False, False), (None, "unknown", True, False),
+    ):  # fmt: skip
+        noisy.append(above)
+        chain: Any = SimpleNamespace(stage=lambda name, made=made: SimpleNamespace(made=made))
+        d: Any = SimpleNamespace(stage="a", verdict=verdict, floor=None, base=None)
+        assert learn._open(chain, d) == asked
+
+
+@dataclass
+class Says:
+    """What a learner said."""
+
+    verdict: str
+    tried: list[Any]
+    notes: list[str]
+    nearest: list[str]
+    why: str = "none fits"
+
+
+class Learning:
+    """Stands for what learns on the stages of a log; answers by stage."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **stages: tuple[str, Says | None]):
+        self.told: list[float] = []
+        self.asked: list[Any] = []
+        models = "vaneloop.discrepancy.models"
+        says = {name: said for name, (_, said) in stages.items()}
+
+        def learner(ground: Any, d: Any, tell: Any, shape: Any, formulas: bool) -> Any:
+            self.asked.append((d.stage, ground, shape, formulas))
+            tell(0.5)
+            return SimpleNamespace(learned=lambda: says[d.stage], judge="judge", base="base")
+
+        monkeypatch.setattr(learn, "_open", lambda chain, d: d.verdict != "missing")
+        monkeypatch.setattr(f"{models}.learning.Learner", learner)
+        monkeypatch.setattr(f"{models}.vane_stages.ground.VaneGround", lambda stage, floor, test: (stage.name, test))
+        monkeypatch.setattr(f"{models}.learned.law_of", lambda ground, before, tried: law(tried.name, before=before))
+        monkeypatch.setattr(f"{models}.spoken.spoken", lambda learner, tried, own: (tried[-1], own))
+        monkeypatch.setattr(learn, "_as_model", lambda model, kept, laws, last: model.noted(f"{len(kept.tried)} laws"))
+        monkeypatch.setattr(learn, "_with_stage", lambda model, judge, fit: model.noted(f"stage of {judge}"))
+        monkeypatch.setattr(learn, "with_fits", lambda model, stages: model.noted(f"fits of {len(stages)}"))
+        self.stages = [
+            SimpleNamespace(name=name, coarse={} if said else {"x_lvdt": "its steps"}, outputs=("y",), made="x")
+            for name, (_, said) in stages.items()
+        ]
+        found = [SimpleNamespace(stage=name, verdict=verdict, floor=0.5) for name, (verdict, _) in stages.items()]
+        self.found: Any = SimpleNamespace(diagnosis=SimpleNamespace(stages=found), effects=["valve_lag"])
+        self.chain: Any = SimpleNamespace(
+            stage=lambda name: next(s for s in self.stages if s.name == name), test=None, steps={"x_lvdt": 0.1}
+        )
+
+    def learned(self, **more: Any) -> Any:
+        """The answer."""
+        return learn.learned(self.chain, "a.csv", Model(), 2, self.told.append, self.found, **more)
+
+
+def curves(*names: str) -> list[Any]:
+    """Curves that were fitted, by name."""
+    return [SimpleNamespace(name=n, judge=f"judge of {n}", fit=f"fit of {n}") for n in names]
+
+
+def test_laws_of_all_stages_are_one_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    at = Learning(
+        monkeypatch,
+        a=("unknown", Says("learned", curves("one", "two"), ["hm"], [])),
+        b=("none", Says("learned", curves("two", "three"), [], [])),
+        c=("missing", None),
+    )
+    said = at.learned(shape=["odd"], formulas=False)
+    assert said.verdict == "learned" and [x.name for x in said.laws] == ["one", "two", "three"]
+    assert said.laws[0].before == ("judge", "base") and said.laws[1].before == ("judge of one", "fit of one")
+    assert said.outcome.notes == ["a: hm", "b: two: another stage says it, too"] and said.steps == {"x_lvdt": 0.1}
+    assert said.model.meta["history"] == [
+        "2 laws", "stage of judge of two", "1 laws", "stage of judge of three", "fits of 1",
+    ]  # fmt: skip
+    assert at.told == pytest.approx([0.25, 0.75, 1.0]) and said.log == "a.csv" and said.diagnosed is at.found
+    assert [(n, shape, formulas) for n, _, shape, formulas in at.asked] == [
+        ("a", ("odd",), False),
+        ("b", ("odd",), False),
+    ]
+    at.chain.test = SimpleNamespace(stages=[SimpleNamespace(name="b")])
+    at.asked.clear()
+    at.learned()
+    assert [ground for _, ground, _, _ in at.asked] == [("a", None), ("b", at.chain.test.stages[0])]
+    assert at.asked[0][3] is True
+
+
+def test_without_a_law_the_answer_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b = Says("unknown", [], ["hm"], ["x", "y"], "a why"), Says("unknown", [], [], ["y", "z"], "b why")
+    said = Learning(monkeypatch, a=("unknown", a), b=("unknown", b), c=("none", Says("none", [], [], []))).learned()
+    assert said.verdict == "unknown" and said.laws == [] and said.model is None and said.outcome.notes == []
+    assert said.outcome.nearest == ["x", "y", "z"] and said.outcome.why == "a: hm; a: a why; b: b why"
+    none = Learning(monkeypatch, a=("none", Says("none", [], [], [])))
+    assert none.learned().verdict == "named" and none.learned().outcome.why == "valve_lag of the library"
+    none.found.effects = []
+    assert none.learned().verdict == "none" and none.learned().outcome.why.endswith("nothing is missing")
+
+
+def test_a_stage_of_a_coarse_reading_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    at = Learning(monkeypatch, a=("unknown", None))
+    assert at.learned().outcome.why == "a: not asked, as it is driven by x_lvdt" and at.asked == []
+    at.stages[0].outputs = ("x_lvdt", "y")
+    assert at.learned().outcome.why == "a: its steps"
+
+
+def test_a_search_before_learning_is_four_tenths_of_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    at = Learning(monkeypatch, a=("unknown", Says("learned", curves("one"), [], [])))
+    monkeypatch.setattr(learn, "of_chain", lambda chain, log, workers, tell: tell(0.5) or at.found)
+    learn.learned(at.chain, "a.csv", Model(), progress=at.told.append)
+    assert at.told == pytest.approx([0.2, 0.7, 1.0])
+
+
+# ---- what is refused, what answers hold ------------------------------------------------------------------------------
+
+
+def test_an_unknown_effect_is_refused_with_the_one_that_is_near() -> None:
+    search.known(["valve_lag", "lvdt_bias"])
+    with pytest.raises(
+        InputError, match="--effect 'valve_leg' is not in the library; probably 'valve_lag' is meant; doc"
+    ):
+        search.known(["valve_lag", "valve_leg"])
+    with pytest.raises(InputError, match="--without 'qqqq' is not in the library; docs/effects.md lists it"):
+        search.known(["qqqq"], "without")
+    assert search._close("valve_leg", ["valve_lag", "other"]) == "close: valve_lag"
+    assert search._close("qqqq", ["valve_lag", "other"]) == "it can have valve_lag, other"
+
+
+def test_values_at_the_end_of_their_tolerance_are_told() -> None:
+    rows = [{"parameter": "k", "value": 1.23456, "unit": "mm", "at_limit": True},
+            {"parameter": "l", "value": 2.0, "unit": "mm", "at_limit": False}]  # fmt: skip
+    d: Any = SimpleNamespace(stage="a", recalibrated=rows)
+    assert search._at_limit([d]) == ["a: k stands at the end of its tolerance, 1.235 mm: the log would have it go on"]
+
+
+def test_fits_become_the_model_s_numbers() -> None:
+    model = Model(parameters={"actuator.flow_gain": 0.1}, effects={"bend": {"c1": 5.0}}, curves={"bend": CURVE})
+    found = [
+        SimpleNamespace(effect="valve_dead_band", parameters={"half_width": {"value": 1.5}, "own": {"value": 3.0}}),
+        SimpleNamespace(effect="bend", parameters={"scale": {"value": 2.0}}),
+    ]
+    d: Any = SimpleNamespace(recalibrated=[{"parameter": "supply.pressure", "value": 20.5}], effects=found)
+    out = search.with_fits(model, [d])
+    assert out.parameters == {"actuator.flow_gain": 0.1, "supply.pressure": 20.5}
+    assert out.effects == {
+        "bend": {"c1": 10.0, "c2": 4.0, "c3": 6.0, "c4": 8.0}, "valve_dead_band": {"half_width": 1.5},
+    }  # fmt: skip
+    assert model.effects == {"bend": {"c1": 5.0}} and list(model.parameters) == ["actuator.flow_gain"]
+
+
+def test_an_experiment_is_recommended_where_rivals_are_left() -> None:
+    diagnosed: Any = SimpleNamespace(diagnosis=SimpleNamespace(notes=["n"]))
+    none = search.Experiment(diagnosed, None, "a.csv")
+    assert none.sentence() == "Nothing to separate: the log leaves no rivals."
+    assert none.to_dict() == {"schema": 1, "log": "a.csv", "recommended": None, "profiles": [], "notes": ["n"]}
+    e = {"score": 3.5, "profile": "p", "repeats": 2, "separates": ["x"], "text": "Run p.", "table": [1], "more": 0}
+    said = search.Experiment(diagnosed, e, "a.csv").to_dict()
+    assert said["recommended"] == {"nats": 3.5, "profile": "p", "repeats": 2, "separates": ["x"], "text": "Run p."}
+    assert said["profiles"] == [1] and search.Experiment(diagnosed, e).sentence() == "Run p."
+
+
+def located(fails: bool) -> Any:
+    """A stage's answer."""
+    signal = SimpleNamespace(json=lambda: {"signal": "y"})
+    return SimpleNamespace(stage="a", fails=fails, fit=None, json=lambda: {"stage": "a"}, signals=[signal])
+
+
+HELD = Held({}, [Failing("a", "y", "mm", 1.0, 2.0, 3.0, 4.0)], (0,), [(0.0, 60.0)])
+
+
+@pytest.mark.parametrize("stages, held, fails", [
+    ([False, False], None, False), ([False, True], None, True), ([False], HELD, True),
+    ([False], replace(HELD, failing=[]), False), ([], None, False),
+])  # fmt: skip
+def test_a_model_fails_where_a_stage_or_a_time_of_a_long_log_does(stages: Any, held: Any, fails: bool) -> None:
+    bound: Any = SimpleNamespace(not_observed={"b": "no x"}, notes=["n"], test=None, stages=[])
+    by_log: Any = SimpleNamespace(json=lambda: {"logs": [1]})
+    said = search.Stages(bound, [located(f) for f in stages], "a.csv", by_log, held=held)
+    out = said.to_dict()
+    assert said.fails == fails and out["verdict"] == ("fails" if fails else "agrees") and out["logs"] == [1]
+    assert (
+        out["stages"] == [{"stage": "a"}] * len(stages) and out["not_observed"] == {"b": "no x"} and out["schema"] == 1
+    )
+    assert out["signals"] == [{"signal": "y", "reference": "measured"}] * len(stages) and "tested" not in out
+    assert ("whole" in out) == (held is not None) and said.verb == "compare"
+    plain = search.Stages(bound, [located(False)], "a.csv").to_dict()
+    assert not {"signals", "verdict", "whole"} & plain.keys() and plain["notes"] == ["n"]
