@@ -97,6 +97,7 @@ def test_the_plant_of_a_table_is_its_numbers_in_si(tmp_path) -> None:
     assert p.lvdt_step == pytest.approx(50e-3 / 2**14)
     assert p.current_limit == pytest.approx(values("calibration.toml")["servo"]["current_limit"] * 1e-3)
     assert (p.p_ref, p.tick, p.delay) == (21e6, 1e-3, 0)
+    assert ServoPlant.from_tables() == ServoPlant()  # the defaults are the shipped table's
 
 
 def test_the_electromechanical_plant_of_a_table_is_its_numbers_in_si() -> None:

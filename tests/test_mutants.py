@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.conftest import ROOT
+from tests.mutants import campaign as trial
 from tests.mutants.__main__ import ENOUGH, STRICT, TARGETS
 from tests.mutants.mutate import PRODUCT, mutants_of
 
@@ -194,6 +197,21 @@ def test_a_test_that_fails_alone_kills_nothing(tmp_path: Path) -> None:
         and "# True" not in run.stdout
         and "alone it fails unchanged" in run.stdout
     )
+
+
+def test_what_waits_for_a_processor_is_not_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, ended, before = [100.0], [], signal.getsignal(signal.SIGALRM)
+    monkeypatch.setattr(trial, "_clock", lambda: now[0])
+    try:
+        trial._end_after(30.0, lambda: ended.append(now[0]))
+        rings: Any = signal.getsignal(signal.SIGALRM)
+        for now[0] in (100.0, 129.9, 130.0, 131.0):
+            rings()
+            assert signal.getitimer(signal.ITIMER_REAL)[0] > 0.0  # it asks again
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    assert ended == [130.0, 131.0]
 
 
 SLOW = """

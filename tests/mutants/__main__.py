@@ -89,7 +89,7 @@ NEAREST = {
     ),
     "hil.native": "native c_reference xcp",
     "hil.loop": "loop lanes lockstep node realtime moments replay native machines frames strategies",
-    "hil.fmu": "fmu",
+    "hil.fmu": "fmu_spec fmu",
     "hil.calibrate": "xcp uds xcp_spec",
     "hil.uds": "uds uds_spec",
     "hil.inject": "inject fuzz campaign loop moments inject_spec fuzz_spec",

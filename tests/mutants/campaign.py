@@ -59,7 +59,7 @@ LEAST_SECONDS = 10.0  # of processor time that a mutant has, beside four times w
 LONGEST_TEST = 5.0  # s of processor time
 # The quickest tests that reach a mutant, up to this: a survivor costs all of it, and a sample has hundreds of them.
 MOST_SECONDS = 20.0  # of processor time
-WAITS = 6.0  # times the processor time of a test may pass on the clock: it waits, and shares the processor
+WAITS = 6.0  # times the processor time of a test may pass on the clock: it waits for others
 
 
 @dataclass(frozen=True)
@@ -357,6 +357,34 @@ class _Campaign:
                         decided(m, by)
 
 
+def _clock() -> float:
+    """Seconds on the clock but those for which the processor served others: a busy machine makes no test late."""
+    try:
+        waited = float(Path("/proc/thread-self/schedstat").read_text().split()[1]) * 1e-9
+    except (OSError, IndexError):  # a kernel that does not count
+        waited = 0.0
+    return time.monotonic() - waited
+
+
+def _end_after(seconds: float, end: Callable[[], object]) -> None:
+    """Call ``end`` once so many seconds of `_clock` have passed, and then every second."""
+    until = _clock() + seconds
+
+    def rings(*_: object) -> None:
+        left = until - _clock()
+        signal.setitimer(signal.ITIMER_REAL, max(left, 1.0))
+        if left <= 0.0:
+            end()
+
+    signal.signal(signal.SIGALRM, rings)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+
+
+def _ended_by_the_alarm() -> None:
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    os.kill(os.getpid(), signal.SIGALRM)
+
+
 def _processor_time() -> float:
     of_children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return time.process_time() + of_children.ru_utime + of_children.ru_stime
@@ -368,11 +396,10 @@ def _within(item: pytest.Item, following: pytest.Item | None) -> str:
     def late(*_: object) -> None:
         raise _TooLong(TOO_LONG)
 
-    for number in (signal.SIGPROF, signal.SIGALRM):
-        signal.signal(number, late)
+    signal.signal(signal.SIGPROF, late)
     begin = _processor_time()
     signal.setitimer(signal.ITIMER_PROF, LONGEST_TEST, 1.0)
-    signal.setitimer(signal.ITIMER_REAL, WAITS * LONGEST_TEST, 1.0)
+    _end_after(WAITS * LONGEST_TEST, late)
     try:
         bad = _failure(item, following)
     except _TooLong:
@@ -471,7 +498,7 @@ def _try(m: Mutant | None, module: ModuleType | None, items: list[pytest.Item], 
         except _NoImport as e:
             return f"import: {e}"
     for item, following in zip(items, [*items[1:], None], strict=True):
-        signal.alarm(int(WAITS * (LEAST_SECONDS + costs[item.nodeid][0])))
+        _end_after(WAITS * (LEAST_SECONDS + costs[item.nodeid][0]), _ended_by_the_alarm)
         bad = _failure(item, following)
         if bad:
             return bad
