@@ -10,6 +10,7 @@ import dataclasses
 import subprocess
 import sys
 import zlib
+from collections import deque
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -737,7 +738,7 @@ def test_a_target_of_uds_answers_requests_of_iso_tp() -> None:
         answers += target.tick([])
     assert [a[:3] for a in answers] == [b"\x06\x50\x03"] and not target.busy and not target.given
     still(target)
-    target.service._in.extend([b""] * 1024)
+    target.service._in, target.service._out = [b""] * 512, [b""] * 512
     target.tick([])
     target.service._transport.tx_queue.put(b"")
     with pytest.raises(AssertionError, match="^1025 frames are kept$"):
@@ -806,7 +807,7 @@ def test_a_limit_must_not_rise_above_the_reference_page_and_nothing_guarded_chan
 
 def test_what_a_service_keeps_has_a_bound(target: Any) -> None:
     still(target)
-    target.service._in.extend([b""] * 600)
+    target.service._in = deque([b""] * 600)
     target.service._out.extend([b""] * 424)
     target.tick([])
     target.service._out.append(b"")

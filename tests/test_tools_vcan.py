@@ -34,13 +34,14 @@ def test_both_clients_talk_to_the_controller_on_vcan0(controller: Path) -> None:
     from hil.bus.port import open_bus
     from hil.uds.station import RESPONSE
     from tests.test_uds import client_on_a_bus
-    from tests.test_xcp import application, save_kp
+    from tests.test_xcp import application, save_kp, unlock_calibration
 
     def calibrate() -> None:
         app = application(interface="socketcan", channel=INTERFACE)
         app.transport.timeout = 10.0
         with Master("can", config=app) as x:
             x.connect()
+            unlock_calibration(x)
             save_kp(x, 11.0)
             x.disconnect()
 

@@ -7,6 +7,7 @@ code.
 from __future__ import annotations
 
 import base64
+import hmac
 import json
 import math
 import struct
@@ -73,10 +74,16 @@ def seed_of(s: Server, k: int = 0) -> bytes:
 
 def unlocked(mode: int = STANDBY, session: int = 3, k: int = 0, **options: Any) -> Server:
     """A server whose lock is open in a session."""
-    out = server(mode, **options)
-    assert asked(out, f"10 0{session}", k) == f"50 0{session} 00 32 01 F4"
-    assert asked(out, b"\x27\x02" + key_of(seed_of(out, k)), k) == "67 02"
+    out = server(STANDBY, **options)
+    unlock(out, k, session)
+    out.node.loop.given.mode = float(mode)
     return out
+
+
+def unlock(s: Server, k: int = 0, session: int = 3) -> None:
+    """Begin a session and open its lock."""
+    assert asked(s, f"10 0{session}", k) == f"50 0{session} 00 32 01 F4"
+    assert asked(s, b"\x27\x02" + key_of(seed_of(s, k)), k) == "67 02"
 
 
 # ---- every service in every session ----------------------------------------------------------------------------------
@@ -84,19 +91,19 @@ def unlocked(mode: int = STANDBY, session: int = 3, k: int = 0, **options: Any) 
 # shortest request: sessions that have the service, how its answer begins there while it is locked
 SHORTEST = {
     "10 01": ((1, 2, 3), "50 01 00 32 01 F4"),
-    "11 01": ((1, 2, 3), "51 01"),
-    "14 FF FF FF": ((1, 2, 3), "54"),
+    "11 01": ((2, 3), "7F 11 33"),
+    "14 FF FF FF": ((2, 3), "7F 14 33"),
     "19 0A": ((1, 2, 3), "59 0A 7F"),
     "22 F1 86": ((1, 2, 3), "62 F1 86"),
     "27 01": ((2, 3), "67 01"),
-    "28 00 01": ((3,), "68 00"),
+    "28 00 01": ((3,), "7F 28 33"),
     "2E F1 99 20": ((3,), "7F 2E 33"),
     "31 01 02 01": ((3,), "7F 31 33"),
     "34 00 44": ((2,), "7F 34 33"),
     "36 01": ((2,), "7F 36 24"),
     "37": ((2,), "7F 37 24"),
     "3E 00": ((1, 2, 3), "7E 00"),
-    "85 01": ((3,), "C5 01"),
+    "85 01": ((3,), "7F 85 33"),
 }
 
 
@@ -217,16 +224,16 @@ def test_a_new_server_is_locked_in_the_default_session_and_may_be_asked_for_a_se
     ],
 )  # fmt: skip
 def test_what_session_reset_and_tester_present_answer(request_: str, answer: str) -> None:
-    assert asked(server(), request_) == answer
+    assert asked(unlocked() if request_.startswith("11") else server(), request_) == answer
 
 
 @pytest.mark.parametrize("mode", range(5))
 def test_what_opens_the_loop_is_done_in_init_and_standby_only(mode: int) -> None:
     refused = mode not in (INIT, STANDBY)
-    for request, answer in {"10 02": "50 02 00 32 01 F4", "11 01": "51 01", "11 03": "51 03"}.items():
-        assert asked(server(mode), request) == (f"7F {request[:2]} 22" if refused else answer), request
-    s = server(mode)
-    asked(s, "10 03")
+    assert asked(server(mode), "10 02") == ("7F 10 22" if refused else "50 02 00 32 01 F4")
+    for request, answer in {"11 01": "51 01", "11 03": "51 03"}.items():
+        assert asked(unlocked(mode), request) == ("7F 11 22" if refused else answer), request
+    s = unlocked(mode)
     assert asked(s, "28 01 01") == ("7F 28 22" if refused else "68 01") and s.silent != refused
     assert asked(s, "28 00 01") == "68 00" and asked(s, "85 02") == "C5 02", "these hold nothing up"
     s = unlocked(session=2)
@@ -279,6 +286,7 @@ def test_a_reset_starts_the_firmware_anew_once_before_the_next_tick() -> None:
     s, z = bench.server, bench.node.loop.z
     s.trouble.entries[3].status = 0x2F
     s.node.loop.given.mode = float(STANDBY)
+    unlock(s, 300)
     was = z.copy()
     assert asked(s, "11 03", 300) == "51 03" and (z == was).all() and s.trouble.entries[3].status == 0x2F
     assert s.before(300) == [] and (z == new_state()).all() and not (z == was).all()
@@ -293,6 +301,7 @@ def test_a_controller_of_your_own_is_not_reset_and_does_not_forget() -> None:
     node.loop.given.mode = float(STANDBY)
     s = Server(Memory(node))
     s.memory.loop = s.memory.loop._replace(foreign=(1,))
+    unlock(s)
     assert asked(s, "11 01") == "7F 11 22"
     was = s.memory.loop.z.copy()
     s.before(1)
@@ -321,7 +330,6 @@ def test_what_is_no_seed_and_no_key(request_: str, answer: str) -> None:
 def test_a_seed_is_good_for_one_key_and_the_latest_counts() -> None:
     s = server()
     asked(s, "10 03")
-    assert asked(s, "27 01") == "67 01 CD 07 2C D8 BE 6F 9F 62", "the first one, as published"
     first, second = seed_of(s), seed_of(s)
     assert first != second
     assert asked(s, b"\x27\x02" + key_of(first)) == "7F 27 35"
@@ -330,6 +338,23 @@ def test_a_seed_is_good_for_one_key_and_the_latest_counts() -> None:
     assert asked(s, b"\x27\x02" + key_of(seed_of(s))) == "67 02"
     assert asked(s, "27 01") == "67 01 00 00 00 00 00 00 00 00"
     assert asked(s, b"\x27\x02" + bytes(8)) == "7F 27 24" and asked(s, "2E F1 99 41") == "6E F1 99"
+
+
+def test_seeds_follow_from_a_number_and_without_one_nobody_foresees_them() -> None:
+    def seeds(**options: Any) -> list[bytes]:
+        s = server(**options)
+        asked(s, "10 03")
+        return [seed_of(s) for _ in range(3)]
+
+    numbers = (0, 7, -(2**63), 2**63 - 1)
+    for number in numbers:
+        of = [hmac.digest(struct.pack("<q", number), f"uds {n}".encode(), "sha256")[:8] for n in (1, 2, 3)]
+        assert seeds(seed=number) == of
+    assert len({s for _ in range(20) for s in seeds()}) == 60
+    s = server(seed=7)
+    s.lock.number = 0
+    asked(s, "10 03")
+    assert [seed_of(s)] == seeds(seed=0)[:1], "a record's note"
 
 
 def wrong_key(s: Server, k: int) -> str:
@@ -347,10 +372,31 @@ def test_after_the_third_wrong_key_there_is_no_seed_for_10000_ticks() -> None:
         assert asked(s, "27 01", k) == "7F 27 37", k
     asked(s, "10 03", 10_776)
     assert asked(s, "27 01", 10_776) == "7F 27 37", "nor in a new session"
+    assert asked(s, b"\x27\x02" + bytes(8), 5000) == "7F 27 24", "without a seed no key is tried"
     assert [wrong_key(s, 10_777) for _ in range(3)] == ["7F 27 35", "7F 27 35", "7F 27 36"]
     assert asked(s, "27 01", 20_776) == "7F 27 37"
     asked(s, b"\x27\x02" + key_of(seed_of(s, 20_777)), 20_777)
     assert asked(s, "2E F1 99 41", 20_777) == "6E F1 99"
+
+
+def test_neither_a_reset_nor_a_restart_ends_the_pause(tmp_path: Path) -> None:
+    kept: list[str] = []
+    s = server(store=kept.append)
+    unlock(s, 100)
+    assert asked(s, "11 01", 100) == "51 01" and s.before(100) == []
+    asked(s, "10 03", 500)
+    assert [wrong_key(s, k) for k in (500, 500, 500)] == ["7F 27 35", "7F 27 35", "7F 27 36"]
+    s.before(501)
+    s.after(501)
+    file = tmp_path / "codes.json"
+    for found, first, wrong in ((kept[-1], "7F 27 37", 3), (kept[-1].replace('keys": 3', 'keys": 1'), "67", 1)):
+        file.write_text(found)
+        again = server(trouble=TroubleMemory.load(file))
+        assert again.trouble.wrong_keys == wrong
+        asked(again, "10 03", 0)
+        assert asked(again, "27 01", 9_999).startswith(first)
+        seed_of(again, 10_000)
+    assert wrong_key(again, 10_000) == "7F 27 35" and wrong_key(again, 10_000) == "7F 27 36"
 
 
 def test_a_right_key_forgives_and_a_new_session_does_not() -> None:
@@ -377,10 +423,31 @@ def test_a_right_key_forgives_and_a_new_session_does_not() -> None:
     ],
 )  # fmt: skip
 def test_what_traffic_and_entries_answer_and_only_then_do(request_: str, answer: str) -> None:
-    s = server()
-    asked(s, "10 03")
+    s = unlocked()
     assert asked(s, request_) == answer
     assert s.silent == (request_ == "28 01 01") and s.trouble.on == (request_ != "85 02")
+
+
+@pytest.mark.parametrize("mode", [RUN, DEGRADED, FAIL_SAFE])
+def test_a_closed_loop_ends_the_silence_for_good(mode: int) -> None:
+    s = unlocked()
+    assert asked(s, "28 01 01") == "68 01" and s.silent
+    s.after(0)
+    assert s.silent
+    s.node.loop.given.mode = float(mode)
+    assert not s.silent, "from the tick on that closes it"
+    s.after(1)
+    s.node.loop.given.mode = float(STANDBY)
+    assert not s.silent and asked(s, "28 01 01") == "68 01" and s.silent
+
+
+def test_a_reset_is_followed_by_the_next_after_5000_ticks_at_the_earliest() -> None:
+    s = server()
+    for k, answer in ((0, "51 01"), (1, "7F 11 22"), (4999, "7F 11 22"), (5000, "51 01"), (9999, "7F 11 22")):
+        unlock(s, k)
+        assert asked(s, "11 01", k) == answer, k
+        s.before(k)
+        assert s.session == (1 if answer == "51 01" else 3)
 
 
 def test_traffic_is_not_stopped_while_a_routine_runs() -> None:
@@ -519,7 +586,8 @@ def test_a_snapshot_has_each_signal_under_its_identifier(record: int) -> None:
     ],
 )  # fmt: skip
 def test_codes_are_cleared_one_or_all(request_: str, answer: str, cleared: Any) -> None:
-    s = server()
+    s = unlocked()
+    s.trouble.changed = False
     s.trouble.entries = [Entry(0x2F, 7, 3, 5, b"a", b"b") for _ in CODES]
     assert asked(s, request_) == answer and s.trouble.changed == (answer == "54")
     for i, entry in enumerate(s.trouble.entries):
@@ -737,7 +805,8 @@ def test_the_file_has_every_code_with_all_that_is_known(tmp_path: Path) -> None:
     wanted = written(
         status=0x2F, failures=3, trips=2, age=1, first=base64.b64encode(b"first").decode(),
         last=base64.b64encode(b"last").decode(),
-    ) | {"texts": {"F199": "20260101"}}  # fmt: skip
+    ) | {"texts": {"F199": "20260101"}, "wrong_keys": 2}  # fmt: skip
+    trouble.wrong_keys = 2
     assert trouble.dump() == json.dumps(wanted, indent=1) + "\n"
     file = tmp_path / "codes.json"
     file.write_text(trouble.dump())
@@ -1135,6 +1204,9 @@ class Wire:
         for frame in frames:
             self.service.hear(ident, bytes.fromhex(frame))
         self.service.before(self.k)
+        while self.service.work():
+            pass
+        self.service.change(self.k, np.zeros((0, 2), np.int64), 0)
         out = self.service.after(self.k)
         self.k += 1
         if out is None:
@@ -1157,7 +1229,7 @@ def test_single_frames_are_answered_in_their_tick_padded_with_cc() -> None:
     assert wire.tick("03 22 F1 86 00 00 00 00") == ["04 62 F1 86 01" + 3 * PAD]
     assert wire.tick() == [] and wire.run(20) == {}
     assert wire.service.idents == (0x7E0, 0x7DF) and not wire.service.silent
-    wire.tick("02 10 03")
+    unlock(wire.server)
     wire.tick("03 28 01 01")
     assert wire.service.silent
 
@@ -1180,30 +1252,53 @@ def test_a_request_to_all_is_marked_so() -> None:
     assert wire.tick("01 99", ident=0x7DF) == [] and wire.tick("01 99") == ["03 7F 99 11" + 4 * PAD]
 
 
-def test_a_flood_of_requests_is_cut_at_64_frames() -> None:
+@pytest.mark.parametrize("ident", [0x7E0, 0x7DF])
+def test_of_a_flood_64_frames_are_kept_the_oldest_go_and_are_counted(ident: int) -> None:
     wire = Wire()
     heard: list[tuple[bool, bytes]] = []
     wire.server.request = lambda k, data, functional=False: heard.append((functional, data)) or []  # type: ignore
-    wire.tick(*["02 3E 80"] * 70)
+    wire.tick(*[f"02 3E {n:02X}" for n in range(70)], ident=ident)
     wire.tick()
-    assert heard == [(False, b"\x3e\x80")] * 64
-    heard.clear()
-    wire.tick(*["02 3E 80"] * 70, ident=0x7DF)
-    wire.tick()
-    assert heard == [(True, b"\x3e\x80")] * 64
+    assert heard == [(ident == 0x7DF, bytes([0x3E, n])) for n in range(6, 70)]
+    assert wire.service.counts == {"dropped": 6, "untaken": 0}
+
+
+def test_first_frames_without_end_wait_for_their_flow_control_to_be_sent() -> None:
+    wire = Wire()
+    for _ in range(50):
+        assert len(wire.tick(*["10 64 2E F1 99 00 00 00"] * 60)) == 4
+        assert len(wire.service._out) <= 64 and len(wire.service._in) <= 64
+        assert wire.service._transport.rx_queue.empty() and wire.service._transport.tx_queue.empty()
+    assert wire.service.dropped > 2500
+
+
+def test_an_answer_without_pauses_goes_out_4_frames_a_tick() -> None:
+    wire = Wire()
+    asks = "22" + " F1 97" * 16
+    raw = bytes.fromhex(asks)
+    wire.tick(f"10 {len(raw):02X} " + raw[:6].hex(" "))
+    for n, at in enumerate(range(6, len(raw), 7), 1):
+        last = wire.tick(f"2{n:X} " + raw[at : at + 7].hex(" "))
+    assert last[0][:2] == "11"
+    came = [wire.tick("30 00 00")] + [wire.tick() for _ in range(30)]
+    frames = [f for tick in came for f in tick]
+    assert len(frames) == 50 and max(map(len, came)) == 4 and [len(t) for t in came[:12]] == [4] * 12
+    assert [f[1] for f in frames] == [f"{n % 16:X}" for n in range(1, 51)]
 
 
 def test_at_most_4_frames_go_out_a_tick_and_16_answers_wait() -> None:
     wire = Wire()
     found = [wire.tick(*["02 3E 00"] * 6, ident=0x7DF), wire.tick(), wire.tick()]
-    assert [len(f) for f in found] == [4, 2, 0] and wire.service.dropped == 0
+    assert [len(f) for f in found] == [4, 2, 0] and wire.service.untaken == 0
     answer = b"\x62" + bytes(19)
     wire.service._answer([answer] * 20)  # the first begins, and waits for flow control
-    assert wire.service.dropped == 4
+    assert wire.service.untaken == 4
     wire.service._answer([answer])
-    assert wire.service.dropped == 4, "one of them has begun, so there is room for one"
-    wire.service._answer([answer])
-    assert wire.service.dropped == 5
+    assert wire.service.untaken == 4, "one of them has begun, so there is room for one"
+    wire.service._answer([b"\x62" + bytes(20)])
+    assert wire.service.untaken == 5 and wire.service.dropped == 0
+    sizes = [r.generator.total_length() for r in wire.service._transport.tx_queue.queue]
+    assert sizes == [20] * 15 + [21], "the oldest goes"
 
 
 def test_a_long_answer_waits_for_flow_control_and_keeps_the_tool_s_pauses() -> None:

@@ -538,6 +538,12 @@ def application(**options: Any) -> Any:
     return app
 
 
+def unlock_calibration(x: Any) -> None:
+    """Open calibration with pyxcp, if it is not open already."""
+    if seed := bytes(x.getSeed(0, 1).seed):
+        x.unlock(len(seed), key_of("cal", seed))
+
+
 def save_kp(x: Any, value: float) -> None:
     """Set kp as a master on classic CAN does, and let the working page be saved."""
     x.setMta(CALIBRATION + 8 * Memory(Node()).by_name()["kp"])
@@ -611,6 +617,7 @@ def test_pyxcp_calibrates_the_installed_command_on_the_embedded_bus(tmp_path: Pa
         Master("can", config=app) as x,
     ):
         x.connect()
+        unlock_calibration(x)
         x.setMta(CALIBRATION + 8 * Memory(Node()).by_name()["kp"])
         assert struct.unpack("<d", x.upload(8))[0] == 16.0
         save_kp(x, 11.0)
@@ -716,4 +723,5 @@ def test_scapy_reads_every_published_request_and_answer() -> None:
     assert set(refused.values()) == {
         *("ERR_CMD_SYNCH", "ERR_OUT_OF_RANGE", "ERR_WRITE_PROTECTED", "ERR_ACCESS_DENIED", "ERR_SEGMENT_NOT_VALID"),
         "ERR_SEQUENCE",
+        "ERR_DAQ_ACTIVE",
     }

@@ -6,6 +6,7 @@ limit from the code.
 
 from __future__ import annotations
 
+import hmac
 import json
 import math
 import os
@@ -25,12 +26,13 @@ import pytest
 
 from controller import Calibration, load_calibration
 from controller.records import FAULTS, INPUTS, SCALARS, STATE
-from hil.bus.frames import ECU_DEMAND, ERROR, EXTENDED, FD, PREPARED, REMOTE, decode_demand, encode_demand, word0
+from hil.bus.frames import ECU_DEMAND, ERROR, EXTENDED, FD, PREPARED, REMOTE, SEEDS, decode_demand, encode_demand, word0
 from hil.calibrate import Attended, Memory, Slave, elements, master, prepare
 from hil.calibrate.a2l import a2l_of
 from hil.calibrate.daq import Daq
 from hil.calibrate.elements import Element
 from hil.calibrate.errors import Refusal
+from hil.calibrate.lock import Lock
 from hil.calibrate.prepare import WORK, AtOnce, Desk, Outside, Task, serve
 from hil.calibrate.slave import key_of
 from hil.calibrate.station import XcpService, data_of, replay_attended, row_of
@@ -205,8 +207,8 @@ def test_the_status_tells_what_is_locked_and_whether_a_list_runs() -> None:
     ("command", "answer"),
     [
         ("F8 01 01", "FE 29"), ("F8 02 01", "FE 22"), ("F8 00 00", "FE 22"), ("F8 00 02", "FE 22"),
-        ("F8 00 03", "FE 22"), ("F8 00 05", "FE 22"), ("F8 00 08", "FE 22"), ("F8 00 04", "FF 00"),
-        ("F7 06 00 00 00 00 00 00", "FE 29"),
+        ("F8 00 03", "FE 22"), ("F8 00 05", "FE 22"), ("F8 00 08", "FF 00"), ("F8 00 04", "FF 00"),
+        ("F8 00 10", "FE 22"), ("F7 06 00 00 00 00 00 00", "FE 29"),
     ],
 )  # fmt: skip
 def test_what_is_no_seed(command: str, answer: str) -> None:
@@ -236,6 +238,60 @@ def test_a_wrong_key_ends_the_session(how: str) -> None:
     assert asked(s, raw[:5] if how == "half" else raw) == "FE 25" and not s.connected
     asked(s, "FF 00")
     assert asked(s, "FD") == "FF 00 05 00 00 00"
+
+
+def test_seeds_follow_from_a_number_and_without_one_nobody_foresees_them() -> None:
+    def seeds(**options: Any) -> list[bytes]:
+        s = slave(locked=("cal", "daq", "stim"), **options)
+        return [bytes.fromhex(asked(s, f"F8 00 0{r}"))[2:] for r in (1, 4, 8)]
+
+    for number in (0, 7, -(2**63), 2**63 - 1):
+        of = [hmac.digest(struct.pack("<q", number), f"xcp {n}".encode(), "sha256")[:6] for n in (1, 2, 3)]
+        assert seeds(seed=number) == of
+    assert len({s for _ in range(20) for s in seeds()}) == 60
+
+
+def wrong_key(s: Slave) -> None:
+    """Connect, ask for a seed, and send a wrong key: the session ends."""
+    asked(s, "FF 00")
+    assert asked(s, "F8 00 01").startswith("FF 06")
+    assert asked(s, "F7 06 00 00 00 00 00 00") == "FE 25" and not s.connected
+
+
+def test_after_the_third_wrong_key_there_is_no_seed_for_10000_ticks_whatever_the_resource() -> None:
+    s = slave(locked=("cal", "daq"))
+    for k in (500, 600, 777):
+        s.k = k
+        wrong_key(s)
+    asked(s, "FF 00")
+    for s.k in (777, 10_776):
+        assert asked(s, "F8 00 01") == "FE 25" == asked(s, "F8 00 04") and s.connected
+        assert asked(s, "F7 06 00 00 00 00 00 00") == "FE 29" and asked(s, "F8 00 08") == "FF 00"
+    s.k = 10_777
+    wrong_key(s)
+    wrong_key(s)
+    asked(s, "FF 00")
+    seed = bytes.fromhex(asked(s, "F8 00 01"))[2:]
+    assert asked(s, b"\xf7\x06" + key_of("cal", seed)) == "FF 04", "a right one forgives"
+    asked(s, "FE")
+    for _ in range(3):
+        wrong_key(s)
+    asked(s, "FF 00")
+    assert asked(s, "F8 00 01") == "FE 25"
+
+
+def test_what_was_not_saved_ends_with_the_session() -> None:
+    for end in ("FE", "wrong key"):
+        s = slave(locked=("daq",))
+        all_of(s, "E6 01 00", "EB 03 00 01")
+        if end == "FE":
+            asked(s, "FE")
+        else:
+            asked(s, "F8 00 04")
+            asked(s, "F7 06 00 00 00 00 00 00")
+        asked(s, "FF 00")
+        assert asked(s, "E5 00 00") == "FF 00 00" and asked(s, "EA 02 00") == "FF 00 00 00", "freeze, the tool's page"
+        assert asked(s, "EA 01 00") == "FF 00 00 01", "the firmware's page is what was calibrated"
 
 
 # ---- texts, reading --------------------------------------------------------------------------------------------------
@@ -759,9 +815,10 @@ def test_the_mode_of_a_list_says_its_event() -> None:
         ("DF 00 00 00", "FF 10 00 00 00 00 01 00"), ("E0 10 00 00 01 00 FF 07", "FF"),
         ("DF 00 00 00", "FF 10 00 00 01 00 FF 07"), ("DF 00 01 00", "FF 10 00 00 00 00 01 00"),
         ("DE 02 00 00", "FF 00"), ("DF 00 00 00", "FF 11 00 00 01 00 FF 07"), ("DE 01 00 00", "FF 00"),
-        ("DF 00 00 00", "FF 51 00 00 01 00 FF 07"), ("E0 10 00 00 01 00 01 00", "FE 11"), ("E2 00 00 00 00 00", "FF"),
-        ("E1 FF 04 01 00 00 00 12", "FE 11"), ("DE 00 00 00", "FF 00"), ("DF 00 00 00", "FF 10 00 00 01 00 FF 07"),
-        ("E1 FF 04 01 00 00 00 12", "FF"), ("DF 00 02 00", "FE 22"), ("DE 03 00 00", "FE 27"), ("DE 01 02 00", "FE 22"),
+        ("DF 00 00 00", "FF 51 00 00 01 00 FF 07"), ("E0 10 00 00 01 00 01 00", "FE 11"),
+        ("E2 00 00 00 00 00", "FE 11"), ("DE 00 00 00", "FF 00"), ("DF 00 00 00", "FF 10 00 00 01 00 FF 07"),
+        ("E2 00 00 00 00 00", "FF"), ("E1 FF 04 01 00 00 00 12", "FF"), ("DF 00 02 00", "FE 22"),
+        ("DE 03 00 00", "FE 27"), ("DE 01 02 00", "FE 22"),
         ("DE FF 01 00", "FE 27"), ("D7 00 01 00", "FF 8C FF 05 0A 06 00"),
         ("F5 05", "FF 31 30 20 6D 73"), ("D7 00 02 00", "FE 22"), ("D7 00 00 01", "FE 22"),
         ("D7 00 00 00", "FF 8C FF 04 01 06 00"), ("F5 04", "FF 31 20 6D 73"),
@@ -796,8 +853,8 @@ def test_clearing_a_list_stops_it_and_keeps_its_tables() -> None:
     script(s, [
         ("E3 00 02 00", "FE 22"), ("E3 00 00 00", "FF"), ("DF 00 00 00", "FF 10 00 00 00 00 01 00"),
         ("DF 00 01 00", "FF 50 00 00 00 00 01 00"), ("E2 00 00 00 00 00", "FF"), ("DB", "FF FF 00 00 00 00 00 00"),
-        ("DE 01 00 00", "FE 2A"), ("E2 00 00 00 00 01", "FE 22"), ("E2 00 01 00 00 00", "FF"),
-        ("DB", "FF FF 04 01 0C 00 00 12"),
+        ("DE 01 00 00", "FE 2A"), ("E2 00 00 00 00 01", "FE 22"), ("E2 00 01 00 00 00", "FE 11"),
+        ("DE 00 01 00", "FF 01"), ("E2 00 01 00 00 00", "FF"), ("DB", "FF FF 04 01 0C 00 00 12"),
     ])  # fmt: skip
 
 
@@ -957,6 +1014,7 @@ def test_inputs_are_given_with_the_list_s_last_frame_if_all_have_come(extra: int
 def test_two_inputs_of_one_table_stand_side_by_side() -> None:
     s = stim("n_dem", "x_lvdt")
     s.daq.lists[1].tables[1] += [(4, 1, INPUT + 4)]
+    assert asked(s, "DE 01 01 00") == "FF 00"
     s.command(frame(0, 81.0))
     s.command(frame(1, 0.25))
     assert given(s) == {}, "half of the table is missing"
@@ -970,6 +1028,29 @@ def test_a_stim_list_that_does_not_run_gives_nothing_and_has_no_frames() -> None
     all_of(s, "DE 00 01 00")
     s.command(frame(0, 81.0))
     assert given(s) == {}
+
+
+def test_while_stim_is_locked_no_list_becomes_one() -> None:
+    s = slave(locked=("stim",))
+    all_of(s, "D6", "D5 00 01 00", "D4 00 00 00 01", "D3 00 00 00 00 01")
+    assert asked(s, "E0 02 00 00 00 00 01 00") == "FE 25" and asked(s, "E0 10 00 00 00 00 01 00") == "FF"
+    seed = bytes.fromhex(asked(s, "F8 00 08"))[2:]
+    assert asked(s, b"\xf7\x06" + key_of("stim", seed)) == "FF 00" and asked(s, "E0 02 00 00 00 00 01 00") == "FF"
+
+
+def test_while_a_list_runs_none_grows_and_its_entries_stay() -> None:
+    s = stim("n_dem", "n_r", extra=1)
+    script(s, [
+        ("D5 00 01 00", "FE 11"), ("D4 00 00 00 01", "FE 11"), ("D4 00 01 00 01", "FE 11"),
+        ("D3 00 01 00 00 01", "FE 11"), ("D3 00 00 00 00 01", "FE 11"), ("E2 00 01 00 00 00", "FE 11"),
+        ("E2 00 00 00 00 00", "FE 22"), ("E0 10 01 00 00 00 01 00", "FE 11"),
+        ("DF 00 01 00", "FF 42 00 00 00 00 01 00"),
+    ])  # fmt: skip
+    s.command(frame(1, 81.0))
+    s.command(frame(2, 80.0))
+    assert given(s) == {"n_dem": 81.0, "n_r": 80.0}
+    all_of(s, "DE 00 01 00", "D3 00 01 00 00 01", "D3 00 00 00 00 01")
+    assert asked(s, "DE 01 01 00") == "FE 2A", "an entry was not written"
 
 
 def test_locked_measurement_locks_stim() -> None:
@@ -1015,8 +1096,10 @@ def test_given_inputs_end_with_their_list_and_after_100_ticks(how: str) -> None:
 def test_stopping_a_measurement_leaves_what_is_given() -> None:
     s = stim("n_dem", extra=1)
     all_of(
-        s, "D3 00 00 00 00 01", "E2 00 00 00 00 00", "E1 FF 04 01 00 00 00 12", "E0 10 00 00 00 00 01 00", "DE 01 00 00"
-    )
+        s, "DE 00 01 00", "D3 00 00 00 00 01", "E2 00 00 00 00 00", "E1 FF 04 01 00 00 00 12",
+        "E0 10 00 00 00 00 01 00", "DE 01 00 00",
+        "DE 01 01 00",
+    )  # fmt: skip
     s.command(frame(1, 81.0))
     all_of(s, "DE 00 00 00")
     assert given(s) == {"n_dem": 81.0}
@@ -1082,9 +1165,12 @@ def test_a_row_is_identifier_length_and_bytes(data: bytes) -> None:
 
 
 class Listener:
-    """A service that takes note of all that it is asked."""
+    """A service that takes note of all that it is asked; what it hears is a frame's ``cost`` of work."""
+
+    name, counts, cost = "listener", {"dropped": 0}, 1  # noqa: RUF012
 
     def __init__(self, memory: Memory, *idents: int, silent: bool = False):
+        self.lock, self.todo, self.worked = Lock("listener", 8, 5), 0, 0
         self.memory, self.idents, self.silent = memory, idents, silent
         self.heard: list[tuple[int, bytes]] = []
         self.calls: list[str] = []
@@ -1092,6 +1178,13 @@ class Listener:
 
     def hear(self, ident: int, data: bytes) -> None:
         self.heard.append((ident, data))
+        self.todo += 1
+
+    def work(self) -> int:
+        if not self.todo:
+            return 0
+        self.todo, self.worked = self.todo - 1, self.worked + 1
+        return self.cost
 
     def change(self, k: int, rows: np.ndarray, n: int) -> tuple[np.ndarray, int]:
         self.calls.append(f"change {k} {n} {len(rows)}")
@@ -1208,6 +1301,9 @@ def test_a_note_among_the_frames_says_that_work_is_done() -> None:
         said: list[Any] = []
         rows = np.zeros((3, 2), np.int64)
         rows[0] = row_of(0x123, b"")
+        assert attended.heed(rows, 3) == 3, "there is no room for it"
+        assert attended.heed(rows, 1) == 2 and rows[1].tolist() == [SEEDS, 5], "once, of the seeds"
+        rows[1] = 0
         assert attended.heed(rows, 1) == 1
         desk.begin(Task("judge", (), said.append), lambda why: None)
         assert attended.heed(rows, 1) == 1 and not rows[1:].any()
@@ -1238,23 +1334,45 @@ def test_recorded_frames_are_given_in_their_ticks() -> None:
 def test_8_commands_are_carried_out_before_a_tick_and_4_answers_go_out_after_it() -> None:
     s = slave()
     service = XcpService(s)
+    attended = Attended(s.memory.node, service)
     assert service.idents == (0x6E0,) and not service.silent and service.memory is s.memory and service.dropped == 0
     assert service.after(0) is None
     for _ in range(9):
         service.hear(0x6E0, b"\xfd")
     service.before(7)
+    attended._work()
     assert s.k == 7 and len(service._in) == 1 and len(service._out) == 8
     out = service.after(7)
     assert out is not None and out.tolist() == [list(row_of(0x6E1, bytes.fromhex("FF0000000000")))] * 4
     service.before(8)
+    attended._work()
     assert [len(x) for x in (service.after(8), service.after(9))] == [4, 1] and service.after(10) is None  # type: ignore
 
 
-def test_256_commands_are_kept_and_the_rest_is_counted() -> None:
+def test_256_commands_are_kept_the_oldest_go_and_are_counted() -> None:
     service = XcpService(slave())
-    for _ in range(259):
-        service.hear(0x6E0, b"\xfd")
-    assert len(service._in) == 256 and service.dropped == 3
+    for n in range(259):
+        service.hear(0x6E0, bytes([n & 0xFF, n >> 8]))
+    assert list(service._in) == [bytes([n & 0xFF, n >> 8]) for n in range(3, 259)] and service.counts == {"dropped": 3}
+
+
+def test_all_services_together_have_a_tick_s_work_and_take_turns() -> None:
+    node = Node(*shipped())
+    memory = Memory(node)
+    one, two = Listener(memory, 0x6E0), Listener(memory, 0x7E0)
+    attended = Attended(node, one, two)
+    both = np.array([row_of(i, b"") for i in (0x6E0, 0x7E0) for _ in range(20)], np.int64)
+    attended.tick(both)
+    assert (one.worked, two.worked) == (4, 4) and attended.lost == {"listener": {"dropped": 0}}
+    two.cost = 2
+    attended.tick(both[:0])
+    assert (one.worked, two.worked) == (7, 7), "the last one of a tick may go beyond"
+    one.todo = 0
+    attended.tick(both[:0])
+    assert (one.worked, two.worked) == (7, 11)
+    two.todo = 0
+    attended.tick(both[:1])
+    assert (one.worked, two.worked) == (8, 11)
 
 
 def test_with_more_than_256_answers_no_command_is_taken() -> None:
@@ -1264,7 +1382,7 @@ def test_with_more_than_256_answers_no_command_is_taken() -> None:
         service._out.extend([b"\xff"] * n)
         service._in.clear()
         service._in.extend([b"\xfd"] * 3)
-        service.before(0)
+        assert service.work() == taken
         assert len(service._in) == 3 - taken and len(service._out) == n + taken
 
 
@@ -1275,10 +1393,12 @@ def test_while_a_check_waits_no_command_is_taken_and_its_answer_comes_with_the_e
     for command in ("EB 01 00 01", "FD"):
         service.hear(0x6E0, bytes.fromhex(command))
     service.before(0)
+    assert [service.work() for _ in range(3)] == [1, 0, 0]
     assert service.after(0) is None and s.waiting and len(service._in) == 1
     held.result = (1, "")
     desk.before(1, 1)
     service.before(1)
+    assert service.work() == 1
     out = service.after(1)
     assert out is not None and [data_of(h, d).hex() for h, d in out.tolist()] == ["ff", "ff0000000000"]
     assert s.memory.ecu_page == 1 and not s.waiting
@@ -1289,6 +1409,7 @@ def test_measurements_come_behind_the_answers() -> None:
     service = XcpService(s)
     service.hear(0x6E0, bytes.fromhex("DE010000"))
     service.before(3)
+    assert service.work() == 1
     out = service.after(3)
     assert out is not None and [data_of(h, d)[:3].hex() for h, d in out.tolist()] == ["ff00", "000300"]
     out = service.after(4)

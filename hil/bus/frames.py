@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ANGLES", "AUTH", "AUTH_NAMES", "COUNTS", "ECU_DEMAND", "ERROR", "EXTENDED", "FD", "FRAMES", "FRESHNESS", "NAMES",
-    "PAUSE", "PREPARED", "REMOTE", "UNAUTHENTIC", "VGV_ANGLES", "VGV_ANGLES_2", "VGV_ANGLES_3", "VGV_HEALTH",
+    "PAUSE", "PREPARED", "REMOTE", "SEEDS", "UNAUTHENTIC", "VGV_ANGLES", "VGV_ANGLES_2", "VGV_ANGLES_3", "VGV_HEALTH",
     "VGV_SERVO", "VGV_STATUS", "decode", "decode_auth", "encode_auth", "from_bytes", "from_message", "new_receiver",
     "receive", "refused", "stand_still", "to_bytes", "to_message", "with_demand", "word0",
 ]  # fmt: skip
@@ -70,6 +70,8 @@ PAUSE = NOTE | EXTENDED | CLASSIC | 0x1FFFFF50
 PREPARED = NOTE | EXTENDED | CLASSIC | 0x1FFFFF51
 # "the freshness value of this tick" (`hil.loop.secured`): word 1 is the value
 FRESHNESS = NOTE | EXTENDED | CLASSIC | 0x1FFFFF52
+# "the seeds of the tools' locks follow from word 1" (`hil.calibrate.lock`)
+SEEDS = NOTE | EXTENDED | CLASSIC | 0x1FFFFF53
 
 
 # ---- bits ------------------------------------------------------------------------------------------------------------

@@ -18,10 +18,11 @@ from hil.calibrate.memory import Memory
 from hil.calibrate.stim import Stimulus
 from vaneloop.base.compiled import in_place
 
-__all__ = ["EVENTS", "Daq"]
+__all__ = ["EVENTS", "STIM", "Daq"]
 
 EVENTS = (("1 ms", 1), ("10 ms", 10))  # name, period in ticks; the event's number is its place
 PAYLOAD, STAMP = 7, 2  # bytes of a frame behind the table's identifier; of them the time's in a list's first table
+MEASURED, STIM = 0x10, 0x02  # modes of a list: measured with a time, or given without
 MOST_LISTS, MOST_TABLES, MOST_ENTRIES = 16, 64, 7
 MOST_FRAMES = 32  # of one tick; what is beyond is an overload: the bus carries some four
 
@@ -40,6 +41,7 @@ class DaqList:
     running: bool = False
     stim: bool = False
     raw: list[bytes] = field(default_factory=list)
+    inputs: list[list[int]] = field(default_factory=list)
     first_pid: int = 0
     plan: np.ndarray = field(default_factory=lambda: np.zeros((0, 4), np.int64))
     heads: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
@@ -104,6 +106,8 @@ class Daq:
         self.step = 4
 
     def _in_order(self, low: int, high: int) -> None:
+        if self.running:
+            raise Refusal(ACTIVE, "a list runs")
         if not low <= self.step <= high:
             raise Refusal(SEQUENCE, "the order is FREE_DAQ, ALLOC_DAQ, ALLOC_ODT, ALLOC_ODT_ENTRY")
 
@@ -116,7 +120,10 @@ class Daq:
 
     def point(self, at: int, table: int, entry: int) -> None:
         """Set the pointer to an entry that exists."""
-        tables = self._list(at).tables
+        own = self._list(at)
+        tables = own.tables
+        if own.running:
+            raise Refusal(ACTIVE, "the list runs")
         if table >= len(tables) or entry >= len(tables[table]):
             raise Refusal(RANGE, f"list {at} has no entry {entry} of table {table}")
         self.pointer = at, table, entry
@@ -165,19 +172,19 @@ class Daq:
         own = self._list(at)
         if own.running:
             raise Refusal(ACTIVE, "the list runs")
-        if mode not in (0x10, 0x02):  # measured with a time, or given without; not alternating, with identifiers
+        if mode not in (MEASURED, STIM):  # not alternating, with identifiers
             raise Refusal(MODE, f"mode (={mode:#x}) must be 0x10, or 0x02 for STIM")
         if event >= len(EVENTS) or prescaler < 1:
             raise Refusal(RANGE, f"event (={event}) must be below {len(EVENTS)}, prescaler (={prescaler}) 1 or more")
-        if mode == 0x02:
+        if mode == STIM:
             for e in (e for t in own.tables for e in t if e is not None):
                 self.stimulus.number(*e)
-        own.event, own.prescaler, own.priority, own.stim = event, prescaler, priority, mode == 0x02
+        own.event, own.prescaler, own.priority, own.stim = event, prescaler, priority, mode == STIM
 
     def mode_of(self, at: int) -> tuple[int, int, int, int]:
         """Return mode, event, prescaler and priority of a list."""
         own = self._list(at)
-        mode = (0x02 if own.stim else 0x10) | own.selected | own.running << 6
+        mode = (STIM if own.stim else MEASURED) | own.selected | own.running << 6
         return mode, max(own.event, 0), own.prescaler, own.priority
 
     def start_list(self, what: int, at: int) -> int:
@@ -218,6 +225,7 @@ class Daq:
         own.first_pid = pid = sum(len(of.tables) for of in before)
         if own.stim:
             own.raw = [b""] * len(own.tables)
+            own.inputs = [[self.stimulus.number(*e) for e in t if e is not None] for t in own.tables]
             return
         plan: list[tuple[int, int, int, int]] = []
         heads = []
@@ -256,17 +264,16 @@ class Daq:
         """Take a frame of a STIM list; with its last one the inputs are given, from tick ``k`` on."""
         for own in self.lists:
             at = data[0] - own.first_pid
-            if own.stim and own.running and 0 <= at < len(own.tables):
+            if own.stim and own.running and 0 <= at < len(own.inputs):
                 own.raw[at] = data[1:]
-                if at == len(own.tables) - 1:
+                if at == len(own.inputs) - 1:
                     values: dict[int, float] = {}
-                    for table, raw in zip(own.tables, own.raw, strict=True):
-                        if len(raw) < 4 * len(table):
+                    for numbers, raw in zip(own.inputs, own.raw, strict=True):
+                        if len(raw) < 4 * len(numbers):
                             return
-                        for i, entry in enumerate(table):
-                            assert entry is not None
-                            values[self.stimulus.number(*entry)] = struct.unpack_from("<f", raw, 4 * i)[0]
-                    own.raw = [b""] * len(own.tables)
+                        for i, number in enumerate(numbers):
+                            values[number] = struct.unpack_from("<f", raw, 4 * i)[0]
+                    own.raw = [b""] * len(own.inputs)
                     self.stimulus.give(k, values)
                 return
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import random
 import struct
 import zlib
 from collections.abc import Callable
@@ -18,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.calibrate.daq import EVENTS, PAYLOAD, STAMP, Daq
+from hil.calibrate.daq import EVENTS, PAYLOAD, STAMP, STIM, Daq
 from hil.calibrate.errors import (
     DENIED,
     LOCKED,
@@ -33,13 +32,14 @@ from hil.calibrate.errors import (
     UNKNOWN,
     Refusal,
 )
+from hil.calibrate.lock import Lock
 from hil.calibrate.memory import CALIBRATION, EXACT, REFERENCE, WORKING, Memory
 from hil.calibrate.prepare import Task
 
 __all__ = ["NAME", "RESOURCES", "Slave", "key_of"]
 
 NAME = "vgv"  # of the A2L file, without its ending
-RESOURCES = {"cal": 0x01, "daq": 0x04}  # what can be locked
+RESOURCES = {"cal": 0x01, "daq": 0x04, "stim": 0x08}  # what can be locked
 OK, ERROR, EVENT = 0xFF, 0xFE, 0xFD
 STORED, OVERLOADED = 0x03, 0x06  # events
 STORE_CAL, DAQ_RUNS = 0x01, 0x40  # bits of the session's status
@@ -63,7 +63,7 @@ class Slave:
     a2l      gives the text of the A2L file
     save     folder into which the working page is frozen; None: it cannot be
     locked   resources that need seed and key: of `RESOURCES`
-    seed     of the seeds' generator
+    seed     number from which the lock's seeds follow; None: the system's entropy
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Slave:
         a2l: Callable[[], str] | None = None,
         save: Path | None = None,
         locked: tuple[str, ...] = (),
-        seed: int = 0,
+        seed: int | None = None,
     ):
         self.memory, self.ident, self.max_cto, self.folder = memory, ident, max_cto, save
         self.daq = Daq(memory, ident)
@@ -85,9 +85,9 @@ class Slave:
         self._a2l = a2l
         self._lockable = sum(RESOURCES[name] for name in set(locked))
         self._locked: int
-        self._generator = random.Random(seed)
+        self.lock = Lock("xcp", SEED, seed)
         self._seed: tuple[int, bytes] | None
-        self._freeze = False
+        self._freeze: bool
         self._mta: tuple[bytes | None, int, int]  # a text of ours or memory: extension, address
         self.waiting = False  # for the result of a check
         self._late: list[bytes] = []
@@ -150,7 +150,7 @@ class Slave:
         if not self.connected:
             return []
         if code < 0xC0:  # a frame of a STIM list; it has no answer
-            if not self._locked & RESOURCES["daq"]:
+            if not self._locked & (RESOURCES["daq"] | RESOURCES["stim"]):
                 self.daq.stimulate(self.k, data)
             return []
         known = self._commands.get(code)
@@ -214,7 +214,9 @@ class Slave:
         self.daq.step = 0
         self._told = self.daq.overloads
         self.memory.forget()
+        self.memory.xcp_page = WORKING
         self._locked, self._seed = self._lockable, None
+        self._freeze = False
         self._mta = None, EXACT, 0
 
     def _disconnect(self, data: bytes) -> list[bytes]:
@@ -257,10 +259,12 @@ class Slave:
         if data[1] == 1:  # a rest of the seed: all of it was in the first frame
             raise Refusal(SEQUENCE, "the whole seed was in the first answer")
         if data[1] != 0 or resource not in RESOURCES.values():
-            raise Refusal(RANGE, f"resource (={resource:#x}) must be one of 0x01, 0x04")
+            raise Refusal(RANGE, f"resource (={resource:#x}) must be one of 0x01, 0x04, 0x08")
         if not self._locked & resource:
             return [bytes([OK, 0])]
-        seed = self._generator.randbytes(SEED)
+        if self.lock.pauses(self.k):
+            raise Refusal(LOCKED, "too many keys were wrong: wait 10 s")
+        seed = self.lock.seed()
         self._seed = resource, seed
         return [bytes([OK, SEED]) + seed]
 
@@ -269,7 +273,8 @@ class Slave:
             raise Refusal(SEQUENCE, "GET_SEED comes first")
         (resource, seed), self._seed = self._seed, None
         name = next(n for n, bit in RESOURCES.items() if bit == resource)
-        if data[1] != SEED or not hmac.compare_digest(data[2 : 2 + SEED], key_of(name, seed)):
+        key = data[2 : 2 + SEED] if data[1] == SEED else b""
+        if not self.lock.fits(self.k, key, key_of(name, seed)):
             self._disconnect(data)  # as the standard has it
             return [self._refuse(LOCKED, "the key is wrong")]
         self._locked &= ~resource
@@ -407,6 +412,8 @@ class Slave:
 
     def _daq_mode(self, data: bytes) -> list[bytes]:
         mode, at, event, prescaler, priority = struct.unpack_from("<BHHBB", data, 1)
+        if mode == STIM and self._locked & RESOURCES["stim"]:
+            raise Refusal(LOCKED, "stim is locked: GET_SEED, UNLOCK")
         self.daq.mode(at, mode, event, prescaler, priority)
         return [bytes([OK])]
 

@@ -1,7 +1,8 @@
 """A node on the bus with the tools that attend to it: frames of theirs are kept from the firmware, and answered.
 
-The tools' commands are carried out before a tick, in order of arrival; answers and measurements are sent after it. What
-takes longer than a tick is done outside of it, and takes effect before the tick whose frames say so.
+The tools' frames are worked on before a tick, of each service in order of arrival; answers and measurements are sent
+after it. A tick has room for so much work and no more: the rest waits, and of what waits too long the oldest is dropped
+and counted. What takes longer than a tick is done outside of it, and takes effect before the tick whose frames say so.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from hil.bus.frames import ERROR, EXTENDED, FD, IDENT_MASK, NOTE, PREPARED, REMOTE
+from hil.bus.frames import ERROR, EXTENDED, FD, IDENT_MASK, NOTE, PREPARED, REMOTE, SEEDS
+from hil.calibrate.lock import Lock
 from hil.calibrate.memory import Memory
 from hil.calibrate.slave import Slave
 from hil.loop.node import Node
@@ -19,8 +21,8 @@ from hil.loop.node import Node
 __all__ = ["MASTER", "SLAVE", "Attended", "Service", "XcpService", "replay_attended"]
 
 MASTER, SLAVE = 0x6E0, 0x6E1  # CAN identifiers of XCP: commands, answers with measurements
-MOST_COMMANDS = 8  # carried out before one tick
-MOST_WAITING = 256  # commands and answers kept; what is beyond is dropped
+MOST_WORK = 8  # before one tick, of all services together: a command of XCP is 1
+MOST_WAITING = 256  # commands kept, and answers beyond which no further command is carried out
 MOST_ANSWERS = 4  # sent after one tick: about what the bus carries
 _KIND = EXTENDED | REMOTE | ERROR | FD | NOTE
 NOTHING = np.zeros((0, 2), np.int64)
@@ -29,7 +31,16 @@ NOTHING = np.zeros((0, 2), np.int64)
 class Service(Protocol):
     """What attends to a node: an XCP slave, a UDS server."""
 
+    name: str
     idents: tuple[int, ...]
+
+    @property
+    def lock(self) -> Lock:
+        """Its seed and key."""
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What it has lost, by name."""
 
     @property
     def memory(self) -> Memory:
@@ -42,7 +53,10 @@ class Service(Protocol):
         """Return what the node gets in place of the first ``n`` rows at tick ``k``."""
 
     def before(self, k: int) -> None:
-        """Work before tick ``k``."""
+        """What time brings before tick ``k``."""
+
+    def work(self) -> int:
+        """Work on the frame that has waited longest; return how much work that was, 0: none waits, or it must wait."""
 
     def after(self, k: int) -> np.ndarray | None:
         """Return frames (int64[n, 2]) to send after tick ``k``."""
@@ -68,14 +82,25 @@ class XcpService:
     dropped  commands that came faster than they could be carried out
     """
 
+    name = "xcp"
     idents: tuple[int, ...] = (MASTER,)
     silent = False
 
     def __init__(self, slave: Slave):
         self.slave = slave
         self.dropped = 0
-        self._in: deque[bytes] = deque()
+        self._in: deque[bytes] = deque(maxlen=MOST_WAITING)
         self._out: deque[bytes] = deque()
+
+    @property
+    def lock(self) -> Lock:
+        """The slave's seed and key."""
+        return self.slave.lock
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Frames of the tool that were dropped."""
+        return {"dropped": self.dropped}
 
     @property
     def memory(self) -> Memory:
@@ -84,23 +109,24 @@ class XcpService:
 
     def hear(self, ident: int, data: bytes) -> None:
         """Keep a command for the next tick."""
-        if len(self._in) < MOST_WAITING:
-            self._in.append(data)
-        else:
-            self.dropped += 1
+        self.dropped += len(self._in) == MOST_WAITING  # the oldest goes
+        self._in.append(data)
 
     def change(self, k: int, rows: np.ndarray, n: int) -> tuple[np.ndarray, int]:
         """Put what a tool gives in place of the ECU's demand into its frames."""
         return self.slave.daq.stimulus.change(k, rows, n)
 
     def before(self, k: int) -> None:
-        """Carry out commands; a tool that floods the slave waits for its answers."""
+        """Take the answers that have come late."""
         self.slave.k = k
         self._out += self.slave.late()
-        for _ in range(min(MOST_COMMANDS, len(self._in))):
-            if self.slave.waiting or len(self._out) > MOST_WAITING:
-                break
-            self._out += self.slave.command(self._in.popleft())
+
+    def work(self) -> int:
+        """Carry out a command; a tool that floods the slave waits for its answers."""
+        if not self._in or self.slave.waiting or len(self._out) > MOST_WAITING:
+            return 0
+        self._out += self.slave.command(self._in.popleft())
+        return 1
 
     def after(self, k: int) -> np.ndarray | None:
         """Return answers and measurements."""
@@ -124,12 +150,19 @@ class Attended:
         self.node, self.services, self.told = node, services, told
         self.desk = services[0].memory.desk
         self._by_ident = {ident: s for s in services for ident in s.idents}
+        self._seeds_noted = False
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.node, name)
 
     def heed(self, rows: np.ndarray, n: int) -> int:
-        """Put a note behind the ``n`` frames of the next tick where work is done; return how many rows there are."""
+        """Put notes behind the ``n`` frames of the next tick: once from which number the seeds follow, and where work
+        is done; return how many rows there are.
+        """
+        if not self._seeds_noted and n < len(rows):
+            self._seeds_noted = True
+            rows[n] = SEEDS, self.services[0].lock.number
+            n += 1
         number = self.desk.note() if n < len(rows) else 0
         if number:
             rows[n] = PREPARED, number
@@ -145,6 +178,10 @@ class Attended:
             if head == PREPARED:
                 theirs.append(i)
                 noted = data
+            elif head == SEEDS:
+                theirs.append(i)
+                for service in self.services:
+                    service.lock.number = data
             elif (service := self._by_ident.get(head & IDENT_MASK)) is not None:
                 theirs.append(i)
                 if head & _KIND == 0:
@@ -152,6 +189,7 @@ class Attended:
         self.desk.before(k, noted)
         for service in self.services:
             service.before(k)
+        self._work()
         rows = np.delete(received[:n], theirs, axis=0) if theirs else received
         n -= len(theirs)
         for service in self.services:
@@ -161,6 +199,21 @@ class Attended:
             out = NOTHING
         more = [sent for service in self.services if (sent := service.after(k)) is not None]
         return np.concatenate([out, *more]) if more else out
+
+    def _work(self) -> None:
+        """Work on the tools' frames, one of each service in turn, until a tick's work is done."""
+        left, waiting = MOST_WORK, deque(self.services)
+        while waiting and left > 0:
+            if done := waiting[0].work():
+                left -= done
+                waiting.rotate(-1)
+            else:
+                waiting.popleft()
+
+    @property
+    def lost(self) -> dict[str, dict[str, int]]:
+        """What each service has lost, because more came than a tick has time for."""
+        return {service.name: service.counts for service in self.services}
 
 
 def replay_attended(node: Attended, at: np.ndarray, received: np.ndarray, ticks: int) -> tuple[np.ndarray, np.ndarray]:

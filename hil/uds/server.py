@@ -1,15 +1,15 @@
 """A UDS server (ISO 14229-1) as a pure machine: a request's bytes in, the answers' bytes out, time in ticks.
 
 It has no clock and no bus. Numbers in data identifiers are big-endian, of single precision, in the units of the border
-(docs/uds.md has every service). A session other than the default one ends 5 s after the last request; what it has
-changed of the traffic and of the trouble memory's entries ends with it.
+(docs/uds.md has every service). Reading is free; what writes, silences or resets needs the key. A session other than
+the default one ends 5 s after the last request; what it has changed of the traffic and of the trouble memory's entries
+ends with it.
 """
 
 from __future__ import annotations
 
 import hashlib
 import hmac
-import random
 import struct
 import zlib
 from collections.abc import Callable
@@ -18,7 +18,8 @@ import numpy as np
 
 from controller import new_state
 from controller.records import INIT, STANDBY
-from hil.calibrate.memory import Memory, Refusal
+from hil.calibrate.lock import ATTEMPTS, Lock
+from hil.calibrate.memory import WORKING, Memory, Refusal
 from hil.calibrate.prepare import Task
 from hil.uds import routines
 from hil.uds.trouble import CODES, MASK, TroubleMemory
@@ -29,8 +30,8 @@ DEFAULT, PROGRAMMING, EXTENDED = 1, 2, 3
 S3, P2, P2_STAR = 5000, 50, 5000  # ticks
 MOST_FILE, BLOCK = 1 << 16, 256  # bytes of a calibration file, of a block with its two bytes of head
 MOST_REQUEST = 1024  # bytes
-ATTEMPTS, DELAY = 3, 10_000  # wrong keys, and the ticks for which the server then gives no seed
 SEED = 8  # bytes
+RESET_AGAIN = 5000  # ticks from one reset to the next: the firmware must get beyond INIT
 CHECKING = 120  # ticks that the check of a loaded file takes: longer than P2, so 0x78 comes first
 
 # negative responses
@@ -69,7 +70,7 @@ class Server:
     memory   the node's memory, as the XCP slave sees it too
     trouble  its trouble codes
     store    called with the trouble memory's text when it has changed; it must not wait
-    silent   the node must not send its own frames (0x28)
+    seed     number from which the lock's seeds follow; None: the system's entropy
     sweep    the routine that runs, or ran last
     """
 
@@ -79,7 +80,7 @@ class Server:
         trouble: TroubleMemory | None = None,
         *,
         store: Callable[[str], None] | None = None,
-        seed: int = 0,
+        seed: int | None = None,
     ):
         self.memory, self.trouble = memory, trouble or TroubleMemory()
         self.node = memory.node
@@ -87,25 +88,24 @@ class Server:
         self._routine = 0
         self._results: dict[int, bytes] = {}
         self._store = store
-        self._generator = random.Random(seed)
+        self.lock = Lock("uds", SEED, seed, self.trouble.wrong_keys)
         self._last: int  # tick of the last request
         self._k: int  # tick of the request
         self._seed: bytes | None
-        self._wrong = 0
-        self._no_seed_until = 0
         self._file: bytearray | None
         self._size: int
         self._block: int
         self._since: int | None = None  # tick at which a file was given; None: none is being checked
         self._found: list[np.ndarray | None] | None = None  # its scalars, once read; None: it is no calibration
         self._reset = False
+        self._reset_again = 0  # the first tick in which a reset may be asked for
         self._end_session()
         all_sessions, not_default = (DEFAULT, PROGRAMMING, EXTENDED), (PROGRAMMING, EXTENDED)
         # service -> what does it, least length, sessions, whether it has a subfunction
         self._services: dict[int, tuple[Callable[[bytes], bytes | None], int, tuple[int, ...], bool]] = {
             0x10: (self._control, 2, all_sessions, True),
-            0x11: (self._ecu_reset, 2, all_sessions, True),
-            0x14: (self._clear, 4, all_sessions, False),
+            0x11: (self._ecu_reset, 2, not_default, True),
+            0x14: (self._clear, 4, not_default, False),
             0x19: (self._read_trouble, 2, all_sessions, True),
             0x22: (self._read, 3, all_sessions, False),
             0x27: (self._security, 2, not_default, True),
@@ -177,6 +177,7 @@ class Server:
         """Look at the faults of tick ``k``, which has been run."""
         trouble = self.trouble
         trouble.look(int(self.memory.loop.given.mode), self.node.faults, self._freeze)
+        self._quiet = self.silent  # a closed loop ends it
         if self.sweep is not None:
             self.sweep.look(k)
             if self.sweep.state != routines.RUNNING:
@@ -210,7 +211,7 @@ class Server:
     def _end_session(self) -> None:
         """Leave everything as it was before the session."""
         self.session = DEFAULT
-        self.silent = self._open = False
+        self._quiet = self._open = False
         self._seed = self._file = None
         self.trouble.on = True
         self._end_sweep(routines.ABORTED)
@@ -236,10 +237,11 @@ class Server:
         self._exactly(data, 2)
         if data[1] not in (1, 3):
             raise Negative(NO_SUBFUNCTION)
+        self._unlocked()
         self._idle()
-        if self.memory.loop.foreign:
+        if self.memory.loop.foreign or self._k < self._reset_again:
             raise Negative(CONDITIONS)
-        self._reset = True
+        self._reset, self._reset_again = True, self._k + RESET_AGAIN
         return data[1:]
 
     def _present(self, data: bytes) -> bytes:
@@ -253,24 +255,21 @@ class Server:
             raise Negative(NO_SUBFUNCTION)
         if data[1] == 1:
             self._exactly(data, 2)
-            if self._k < self._no_seed_until:
+            if self.lock.pauses(self._k):
                 raise Negative(WAIT)
             if self._open:
                 return b"\x01" + bytes(SEED)
-            self._seed = self._generator.randbytes(SEED)
+            self._seed = self.lock.seed()
             return b"\x01" + self._seed
         self._exactly(data, 2 + SEED)
         if self._seed is None:
             raise Negative(SEQUENCE)
         seed, self._seed = self._seed, None
-        if hmac.compare_digest(data[2:], key_of(seed)):
-            self._open, self._wrong = True, 0
-            return b"\x02"
-        self._wrong += 1
-        if self._wrong >= ATTEMPTS:
-            self._wrong, self._no_seed_until = 0, self._k + DELAY
-            raise Negative(ATTEMPTED)
-        raise Negative(WRONG_KEY)
+        self._open = self.lock.fits(self._k, data[2:], key_of(seed))
+        self.trouble.count_keys(self.lock.wrong)
+        if not self._open:
+            raise Negative(ATTEMPTED if self.lock.wrong >= ATTEMPTS else WRONG_KEY)
+        return b"\x02"
 
     def _communication(self, data: bytes) -> bytes:
         self._exactly(data, 3)
@@ -278,15 +277,17 @@ class Server:
             raise Negative(NO_SUBFUNCTION)
         if data[2] != 1:  # the controller's own frames
             raise Negative(RANGE)
+        self._unlocked()
         if data[1] == 1:
             self._idle()
-        self.silent = data[1] == 1
+        self._quiet = data[1] == 1
         return data[1:2]
 
     def _setting(self, data: bytes) -> bytes:
         self._exactly(data, 2)
         if data[1] not in (1, 2):
             raise Negative(NO_SUBFUNCTION)
+        self._unlocked()
         self.trouble.on = data[1] == 1
         return data[1:]
 
@@ -294,6 +295,7 @@ class Server:
 
     def _clear(self, data: bytes) -> bytes:
         self._exactly(data, 4)
+        self._unlocked()
         if not self.trouble.clear(int.from_bytes(data[1:], "big")):
             raise Negative(RANGE)
         return b""
@@ -460,6 +462,8 @@ class Server:
         if found is None:
             raise Negative(FAILURE)
         self._idle()  # the loop may have been closed since the file was given
+        if self.memory.ecu_page != WORKING:  # the firmware would not use it
+            raise Negative(CONDITIONS)
         of = enumerate(self.memory.elements[: len(found)])
         try:
             self.memory.change({i: float(found[i]) for i, e in of if e.table == "calibration"}, judged=True)
@@ -472,8 +476,17 @@ class Server:
         if len(data) != n:
             raise Negative(LENGTH)
 
+    @property
+    def _loop_open(self) -> bool:
+        return int(self.memory.loop.given.mode) in (INIT, STANDBY)
+
+    @property
+    def silent(self) -> bool:
+        """Whether the node must not send its own frames (0x28): never while the loop is closed."""
+        return self._quiet and self._loop_open
+
     def _idle(self) -> None:
-        if int(self.memory.loop.given.mode) not in (INIT, STANDBY) or self.sweep is not None:
+        if not self._loop_open or self.sweep is not None:
             raise Negative(CONDITIONS)
 
     def _unlocked(self) -> None:

@@ -71,12 +71,14 @@ class TroubleMemory:
 
     on       False: nothing is entered (0x85)
     changed  set with every change; whoever stores the memory resets it
+    wrong_keys  wrong keys in a row (0x27): a restart does not forgive them
     """
 
     entries: list[Entry] = field(default_factory=lambda: [Entry() for _ in CODES])
     on: bool = True
     changed: bool = False
     texts: dict[str, str] = field(default_factory=dict)  # what a tool has written (0x2E), by identifier
+    wrong_keys: int = 0
     _before: int = 0
     _tested: int = 0
 
@@ -125,6 +127,11 @@ class TroubleMemory:
         self._before = self._tested = 0
         self.changed = True
 
+    def count_keys(self, wrong: int) -> None:
+        """Keep how many wrong keys there were in a row."""
+        self.changed |= wrong != self.wrong_keys
+        self.wrong_keys = wrong
+
     def clear(self, number: int) -> bool:
         """Forget one trouble code, or all with `ALL`; False where there is no such code."""
         numbers = [c.number for c in CODES.values()]
@@ -158,7 +165,8 @@ class TroubleMemory:
             }
             for (name, c), e in zip(CODES.items(), self.entries, strict=True)
         ]  # fmt: skip
-        return json.dumps({"schema": 1, "codes": rows, "texts": self.texts}, indent=1) + "\n"
+        kept = {"schema": 1, "codes": rows, "texts": self.texts, "wrong_keys": self.wrong_keys}
+        return json.dumps(kept, indent=1) + "\n"
 
     @classmethod
     def load(cls, file: Path) -> TroubleMemory:
@@ -185,6 +193,9 @@ class TroubleMemory:
                     raise ValueError(f"{name} has a freeze frame of more than 255 bytes")
                 status, failures, trips, age = numbers
                 out.entries[i] = Entry(status, failures, trips, age, first, last)
+            out.wrong_keys = int(data.get("wrong_keys", 0))
+            if not 0 <= out.wrong_keys <= 255:
+                raise ValueError("wrong_keys is beyond 255")
             out.texts = {str(k)[:4]: str(v)[:32] for k, v in data["texts"].items()}
         except OSError as e:
             raise InputError(f"{file}: cannot be read ({e.strerror})") from None

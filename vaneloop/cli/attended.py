@@ -25,9 +25,15 @@ def add_service_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--xcp-save", metavar="DIR", help="folder into which a tool may save the working page, for --tables"
     )
-    group.add_argument("--xcp-lock", action="store_true", help="calibration and measurement need seed and key")
+    group.add_argument(
+        "--xcp-open", action="store_true", help="calibration and STIM need no seed and key, as they do without this"
+    )
+    group.add_argument("--xcp-lock", action="store_true", help="measurement needs seed and key too")
     group.add_argument("--uds", action="store_true", help="answer service tools: UDS on ISO-TP (docs/uds.md)")
     group.add_argument("--uds-memory", metavar="F.json", help="file that keeps the trouble codes over a restart")
+    group.add_argument(
+        "--tool-seed", metavar="N", type=int, help="seeds of the locks follow from N (default: nobody can foresee them)"
+    )
 
 
 def wanted(args: argparse.Namespace) -> bool:
@@ -39,9 +45,16 @@ def check_service_options(args: argparse.Namespace, lockstep: bool) -> None:
     """Refuse options that do not go together. Raises InputError."""
     from vaneloop.base.errors import InputError
 
-    for option in ("xcp_save", "xcp_lock"):
+    for option in ("xcp_save", "xcp_lock", "xcp_open"):
         if getattr(args, option) and not args.xcp:
             raise InputError(f"--{option.replace('_', '-')} belongs to --xcp")
+    if args.xcp_lock and args.xcp_open:
+        raise InputError("--xcp-lock and --xcp-open exclude each other")
+    if args.tool_seed is not None:
+        if not wanted(args):
+            raise InputError("--tool-seed belongs to --xcp and --uds")
+        if not 0 <= args.tool_seed < 2**63:
+            raise InputError(f"--tool-seed (={args.tool_seed}) must be 0 to 2^63 - 1")
     if args.uds_memory and not args.uds:
         raise InputError("--uds-memory belongs to --uds")
     if args.uds:
@@ -99,7 +112,8 @@ def attend(args: argparse.Namespace, node: Any, *, recorded: bool = False) -> An
         ident=SLAVE,
         a2l=lambda: text,
         save=Path(args.xcp_save) if args.xcp_save else None,
-        locked=("cal", "daq") if args.xcp_lock else (),
+        locked=() if args.xcp_open else ("cal", "stim", "daq") if args.xcp_lock else ("cal", "stim"),
+        seed=args.tool_seed,
     )
     return Attended(node, XcpService(slave), *services, told=True)
 
@@ -110,12 +124,12 @@ def _uds(args: argparse.Namespace, memory: Any) -> Any:
     from hil.uds.station import UdsService
 
     if not args.uds_memory:
-        return UdsService(Server(memory))
+        return UdsService(Server(memory, seed=args.tool_seed))
     file = Path(args.uds_memory)
     trouble = TroubleMemory.load(file)
     keeper = _Keeper(file)
     keeper(trouble.dump())
-    return UdsService(Server(memory, trouble, store=keeper))
+    return UdsService(Server(memory, trouble, store=keeper, seed=args.tool_seed))
 
 
 class _Keeper:

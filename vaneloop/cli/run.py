@@ -10,6 +10,8 @@ from vaneloop.cli import attended, options, station
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
+LOST = {"dropped": "frames dropped", "untaken": "answers not taken"}  # of a service, `hil.calibrate.Attended.lost`
+
 DESCRIPTION = """Controller with its plant as a node on the CAN bus: it takes ECU_DEMAND and sends VGV_STATUS,
 VGV_SERVO, VGV_ANGLES (_2, _3) and VGV_HEALTH (tables/vgv.dbc), 1,000 ticks a second. On vcan0 or local in real
 time, until --duration or Ctrl-C; at the end it says how late its ticks were. On lockstep in simulated time with an ECU
@@ -187,6 +189,16 @@ def _secured(args: argparse.Namespace, node: Any, authenticator: Any, clock: Any
     return Secured(node, authenticator, DEMANDED, clock)
 
 
+def _say_tools(args: argparse.Namespace, serviced: Any) -> dict[str, Any]:
+    """Say what was lost of tools' frames because more came than a tick has time for; return it for the JSON."""
+    if not attended.wanted(args):
+        return {}
+    for name, lost in serviced.lost.items():
+        said = ", ".join(f"{n:,} {LOST[what]}" for what, n in lost.items())
+        terminal.say(args, f"tools over {name.upper()}: {said}")
+    return {"tools": serviced.lost}
+
+
 def _say_node(args: argparse.Namespace, node: Any) -> None:
     c, state = node.counts, _node_json(node)
     faults = ", ".join(state["faults"]) or "none"
@@ -254,6 +266,7 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
         f"frames: {report.received:,} taken, {report.sent:,} sent, {port.refused:,} not taken by the bus, "
         f"{port.lost:,} lost",
     )
+    tools = _say_tools(args, serviced)
     _say_node(args, serviced)
     exceeded = []
     if report.failed:
@@ -275,7 +288,7 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
         "policy": args.policy, "realtime_priority": args.realtime_priority, "spin_us": args.spin_us, "notes": notes,
         "frames": {"received": report.received, "sent": report.sent, "refused": port.refused, "lost": port.lost,
         "bus_errors": port.errors},
-        **_node_json(node), "secoc": station.authentication_json(args, serviced), "record": record,
+        **tools, **_node_json(node), "secoc": station.authentication_json(args, serviced), "record": record,
         "exceeded": exceeded,
     })  # fmt: skip
     return 1 if exceeded else 0
@@ -440,13 +453,14 @@ def _repeat(args: argparse.Namespace) -> int:
             exceeded.append(f"{len(was):,} frames were sent, now {len(sent):,}")
         else:
             terminal.say(args, f"all {len(was):,} frames sent are the same, bit for bit, in the same ticks")
+    tools = _say_tools(args, whole)
     _say_node(args, whole)
     for line in exceeded:
         terminal.say(args, f"differs: {line}")
     terminal.write_json(args, {
         "schema": 1, "bus": "lockstep", "time": "simulated", "inputs": args.inputs, "ticks": ticks,
         "simulated_s": ticks / 1000,
-        "wall_s": wall, "compared": len(was), "same": not exceeded, **_node_json(node),
+        "wall_s": wall, "compared": len(was), "same": not exceeded, **tools, **_node_json(node),
         "secoc": station.authentication_json(args, whole), "notes": notes,
         "exceeded": exceeded,
     })  # fmt: skip

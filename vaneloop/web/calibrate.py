@@ -146,4 +146,4 @@ class Calibrate:
             command_line("vaneloop run --tables tuned/")
         bus = self.loop.bus_name if self.loop.bus != "lockstep" else "vcan0"
         ui.label("Without this page: the controller on a bus that INCA, CANape or pyxcp join.").classes("note")
-        command_line(shlex.join(["vaneloop", "run", "--bus", bus, "--xcp", "--xcp-save", "tuned/"]))
+        command_line(shlex.join(["vaneloop", "run", "--bus", bus, "--xcp", "--xcp-open", "--xcp-save", "tuned/"]))

@@ -116,7 +116,7 @@ def _attended(progress: Progress, node: Any, tuned: str | None, bus: str = "") -
     """
     from vaneloop.cli.attended import attend
 
-    args = parsed("run", ["--xcp", "--xcp-save", str(tuned)])
+    args = parsed("run", ["--xcp", "--xcp-open", "--xcp-save", str(tuned)])
     attended = attend(args, node, recorded=not bus)
     attended.told = bool(bus)
     progress(None, {"elements": attended.services[0].memory.elements})
