@@ -8,17 +8,20 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
 import pytest
 
 from hil.bus.frames import ERROR, REMOTE
-from hil.calibrate import Memory
+from hil.calibrate import Memory, station
+from hil.calibrate.lock import Lock
 from hil.calibrate.station import MASTER
 from hil.inject import fuzz
 from hil.inject.fuzz import KINDS, Campaign, make_attack, read_attack, run_attack, write_attack
 from hil.inject.fuzz_tools import fuzz_tools
+from hil.uds.server import Server
 from tests.columns import FAIL_SAFE, INIT, RUN, STANDBY
 from tests.conftest import ROOT
 from vaneloop.cli.main import main
@@ -234,6 +237,15 @@ def test_ten_thousand_hostile_commands_of_a_tool_do_no_harm(tool: str) -> None:
     hostile(tool, 10_000)
 
 
+def test_sequences_of_both_protocols_do_no_harm() -> None:
+    hostile("both", 2_000)
+
+
+@pytest.mark.slow
+def test_sixty_thousand_frames_of_sequences_do_no_harm() -> None:
+    hostile("both", 60_000)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("tool", ["xcp", "uds"])
 def test_two_hundred_thousand_hostile_commands_of_a_tool_do_no_harm(tool: str) -> None:
@@ -244,12 +256,29 @@ FREE = np.array([np.inf, np.inf])
 
 
 def hostile(tool: str, frames: int) -> None:
-    if tool == "uds":
+    if tool != "xcp":
         pytest.importorskip("isotp")
     campaign = fuzz_tools(tool, frames, seed=31, limits=FREE)
     assert not campaign.failure and campaign.frames >= frames
     refused = [name for name in campaign.answers if name.startswith("fe") or name == "answers"]
-    assert len(refused) > (5 if tool == "xcp" else 0), campaign.answers
+    assert len(refused) > (0 if tool == "uds" else 5), campaign.answers
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("where", "name", "broken", "said"),
+    [
+        (Server, "silent", property(lambda s: s._quiet), "no frame was sent in"),
+        (Server, "_unlocked", lambda s: None, "something was changed without a key"),
+        (Lock, "fits", lambda s, k, key, right: True, "something was changed without a key"),
+        (station, "MOST_WORK", 20, "frames' work in one tick"),
+    ],
+)
+def test_a_campaign_of_sequences_notices_what_is_broken(
+    where: Any, name: str, broken: Any, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(where, name, broken)
+    assert said in fuzz_tools("both", 30_000, seed=1, limits=FREE).failure
 
 
 def test_a_campaign_against_tools_notices_a_monitor_that_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:

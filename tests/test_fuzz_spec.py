@@ -578,11 +578,11 @@ FREE = np.array([np.inf, np.inf])
 
 def test_a_long_request_is_cut_into_frames_of_iso_tp() -> None:
     request = bytes(range(1, 21))
-    assert fuzz_tools._in_frames(0x700, request) == [
+    assert fuzz_tools.in_frames(0x700, request) == [
         (0x700, b"\x10\x14" + request[:6]), (0x700, b"\x21" + request[6:13]), (0x700, b"\x22" + request[13:20]),
     ]  # fmt: skip
-    assert fuzz_tools._in_frames(0x700, bytes(13))[1:] == [(0x700, b"\x21" + bytes(7))]
-    long = fuzz_tools._in_frames(0x701, bytes(0x123))
+    assert fuzz_tools.in_frames(0x700, bytes(13))[1:] == [(0x700, b"\x21" + bytes(7))]
+    long = fuzz_tools.in_frames(0x701, bytes(0x123))
     assert long[0][1][:2] == b"\x11\x23" and [d[0] for _, d in long[1:18]] == [0x20 | n & 15 for n in range(1, 18)]
 
 
@@ -683,7 +683,7 @@ def test_hostile_requests_of_uds_are_known_services_sessions_pieces_and_long_one
 
 
 def test_a_server_s_seed_is_answered_with_its_key_now_and_then() -> None:
-    key = fuzz_tools._in_frames(0x7E0, b"\x27\x02" + uds_key(b"12345678"))
+    key = fuzz_tools.in_frames(0x7E0, b"\x27\x02" + uds_key(b"12345678"))
     answered = [of for of in drawn(fuzz_tools._uds, uds_target(b"12345678"), 1000) if of == key]
     assert 60 < len(answered) < 140
     assert not any(of == key for of in drawn(fuzz_tools._uds, uds_target(), 500))
@@ -757,7 +757,7 @@ BROKEN: list[tuple[str, float, str]] = [
 
 def still(target: Any, out: Any = ()) -> None:
     """The node stands still: what its record says is what the test put there."""
-    target.attended = SimpleNamespace(tick=lambda rows: np.array(out, np.int64).reshape(-1, 2))
+    target.attended = SimpleNamespace(worked=0, tick=lambda rows: np.array(out, np.int64).reshape(-1, 2))
     given = target.node.loop.given
     given.i_cmd, given.x_dem, given.mode = 0.0, 0.02, 0.0
 

@@ -144,6 +144,7 @@ class Attended:
 
     told  a tick's frames say when work that was prepared takes effect: in real time (`heed`), and in a record of it.
           False: with the tick after it was asked for
+    worked  work on tools' frames before the last tick
     """
 
     def __init__(self, node: Node, *services: Service, told: bool = False):
@@ -151,6 +152,7 @@ class Attended:
         self.desk = services[0].memory.desk
         self._by_ident = {ident: s for s in services for ident in s.idents}
         self._seeds_noted = False
+        self.worked = 0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.node, name)
@@ -202,10 +204,10 @@ class Attended:
 
     def _work(self) -> None:
         """Work on the tools' frames, one of each service in turn, until a tick's work is done."""
-        left, waiting = MOST_WORK, deque(self.services)
-        while waiting and left > 0:
+        self.worked, waiting = 0, deque(self.services)
+        while waiting and self.worked < MOST_WORK:
             if done := waiting[0].work():
-                left -= done
+                self.worked += done
                 waiting.rotate(-1)
             else:
                 waiting.popleft()

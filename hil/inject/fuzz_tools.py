@@ -1,7 +1,9 @@
-"""The safety campaign for the tools' protocols: hostile commands of XCP or UDS against a controller in simulated time.
+"""The safety campaign for the tools' protocols: hostile commands of XCP or UDS against a controller in simulated time,
+or sequences of both (`hil.inject.tool_rules`).
 
 In every tick: current and stroke demand within their limits and the current's within the reference page's, a mode that
-exists, the monitors as they were while the loop is closed, memory of the services bounded. At the end of each episode
+exists, the monitors as they were while the loop is closed, memory of the services and their work bounded, no silence
+while the loop is closed. Without a key nothing is changed at all. At the end of each episode
 the tool is gone, and with the calibration of the beginning good frames of the ECU must have RUN back. Over all episodes
 the process does not grow.
 """
@@ -22,7 +24,8 @@ from controller import MODES
 from controller.records import INIT, STANDBY
 from hil.calibrate.memory import CALIBRATION, Memory
 from hil.calibrate.slave import Slave, key_of
-from hil.calibrate.station import MASTER, MOST_WAITING, Attended, XcpService, data_of, row_of
+from hil.calibrate.station import MASTER, MOST_WAITING, MOST_WORK, Attended, XcpService, data_of, row_of
+from hil.inject.tool_rules import Tool, in_frames, rules_of
 from hil.loop.node import Ecu, Node
 
 __all__ = ["ToolCampaign", "fuzz_tools"]
@@ -67,18 +70,23 @@ class _Target:
         self.guarded = np.array([i for i, e in enumerate(self.memory.elements) if e.guarded])
         self.limit = self.memory.by_name()["current_limit"]
         self.protocol = protocol
-        if protocol == "xcp":
-            self.slave = Slave(self.memory, seed=seed, locked=("cal",) if seed % 3 == 0 else ())
-            self.service: Any = XcpService(self.slave)
-        else:
+        self.keys = protocol != "both" or seed % 2 == 0  # whether a right key may come
+        self.services: list[Any] = []
+        if protocol != "uds":
+            locked = ("cal", "stim") if protocol == "both" else ("cal",) if seed % 3 == 0 else ()
+            self.slave = Slave(self.memory, seed=seed, locked=locked)
+            self.services.append(XcpService(self.slave))
+        if protocol != "xcp":
             from hil.uds.server import Server
             from hil.uds.station import UdsService
 
             self.server = Server(self.memory, seed=seed)
-            self.service = UdsService(self.server)
-        self.attended = Attended(self.node, self.service)
+            self.services.append(UdsService(self.server))
+        self.service = self.services[0]
+        self.attended = Attended(self.node, *self.services)
         self.ecu = Ecu(n_dem=70.0)
         self.ecu.set_demand(70.0, mode_request=request)
+        self.away = 0  # ticks for which the ECU is not heard
         self.sent = np.zeros((0, 2), np.int64)
         self.before = self.memory.live()
 
@@ -90,44 +98,61 @@ class _Target:
     @property
     def given(self) -> bool:
         """Whether a tool still gives the demand: by STIM, by a routine."""
-        return bool(self.slave.daq.stimulus.given if self.protocol == "xcp" else self.server.sweep)
+        stim = self.protocol != "uds" and self.slave.daq.stimulus.given
+        return bool(stim or (self.protocol != "xcp" and self.server.sweep))
 
     @property
     def busy(self) -> bool:
         """Whether frames of the tool still wait."""
-        return bool(self.service._in) or self.memory.desk.waiting
+        return any(service._in for service in self.services) or self.memory.desk.waiting
 
     def tick(self, frames: list[tuple[int, bytes]]) -> list[bytes]:
         """Run a tick; raise AssertionError in words for what does not hold."""
         closed = int(self.node.loop.given.mode) not in (INIT, STANDBY)
         mine = [row_of(i, d) for i, d in frames]
         self.sent_to += [(self.node.k, row) for row in mine]
-        rows = [*self.ecu.tick(self.sent).tolist(), *mine]
+        demand = self.ecu.tick(self.sent).tolist()
+        rows = [*(demand if self.away <= 0 else []), *mine]
+        self.away -= 1
         out = self.attended.tick(np.array(rows, np.int64).reshape(-1, 2))
         ours = out[:, 0] & 0x7FF < 0x100
         self.sent = out[ours].copy()
         loop = self.node.loop
         limit = float(loop.calibration.scalars.current_limit)
-        if not abs(float(loop.given.i_cmd)) <= limit + 1e-12:
-            raise AssertionError(f"current (={loop.given.i_cmd:g} A) beyond its limit (={limit:g} A)")
+        given = loop.given
+        mode = int(given.mode)
+        if not abs(float(given.i_cmd)) <= limit + 1e-12:
+            raise AssertionError(f"current (={given.i_cmd:g} A) beyond its limit (={limit:g} A)")
         for what, value, most in zip(
-            ("current", "stroke demand"), (abs(loop.given.i_cmd), loop.given.x_dem), self.limits, strict=True
+            ("current", "stroke demand"), (abs(given.i_cmd), given.x_dem), self.limits, strict=True
         ):
             if not value <= most + 1e-12:
                 raise AssertionError(f"{what} (={value:g}) beyond the limit asked for (={most:g})")
         if not limit <= self.reference[self.limit]:
             raise AssertionError(f"current_limit (={limit:g} A) above the reference page's")
-        if not 0 <= int(loop.given.mode) < len(MODES):
-            raise AssertionError(f"mode (={loop.given.mode:g}) does not exist")
+        if not 0 <= mode < len(MODES):
+            raise AssertionError(f"mode (={given.mode:g}) does not exist")
         now = self.memory.live()
         if closed and (now[self.guarded] != self.before[self.guarded]).any():
             raise AssertionError("a limit or a monitor was changed while the loop was closed")
         self.before = now
-        held = sum(len(getattr(self.service, name)) for name in ("_in", "_out"))
-        if self.protocol == "uds":
-            held += self.service._transport.tx_queue.qsize()
+        held = sum(len(getattr(service, name)) for service in self.services for name in ("_in", "_out"))
+        if self.protocol != "xcp":
+            transport = self.services[-1]._transport
+            held += transport.tx_queue.qsize() + transport.rx_queue.qsize()
         if held > MOST_HELD:
             raise AssertionError(f"{held} frames are kept")
+        if self.attended.worked > MOST_WORK + 1:
+            raise AssertionError(f"{self.attended.worked} frames' work in one tick")
+        if self.protocol != "xcp":
+            if mode not in (INIT, STANDBY) and self.node.k % 10 == 1 and not ours.any():
+                raise AssertionError(f"no frame was sent in {MODES[mode]}")
+            server, slave = self.server, getattr(self, "slave", None)
+            if not self.keys and (
+                (now != self.reference).any() or server.silent or server.sweep or server.trouble.texts
+                or not server.trouble.on or server._reset_again or (slave and slave.daq.stimulus.given)
+            ):  # fmt: skip
+                raise AssertionError("something was changed without a key")
         return [data_of(h, d) for h, d in out[~ours].tolist()]
 
 
@@ -168,21 +193,28 @@ def _uds(rng: np.random.Generator, target: _Target, last: bytes) -> list[tuple[i
     elif kind == 5:
         raw = bytearray([0x10, int(rng.choice([1, 2, 3, 3]))])
     elif kind == 6 and target.server._seed is not None:
-        return _in_frames(REQUEST, b"\x27\x02" + uds_key(target.server._seed))
+        return in_frames(REQUEST, b"\x27\x02" + uds_key(target.server._seed))
     elif kind == 7:  # pieces of ISO-TP in any order
         return [(REQUEST, bytes([int(rng.choice([0x10, 0x20, 0x21, 0x30, 0x31]))]) + bytes(raw))]
     elif kind == 8:
         long = bytearray(rng.integers(0, 256, rng.integers(8, 100), dtype=np.uint8).tobytes())
         long[0] = int(rng.choice([*target.server._services, long[0]]))
-        return _in_frames(REQUEST, bytes(long))
+        return in_frames(REQUEST, bytes(long))
     return [(ident, bytes([len(raw)]) + bytes(raw))]
 
 
-def _in_frames(ident: int, request: bytes) -> list[tuple[int, bytes]]:
-    """A request of more than seven bytes as ISO-TP's frames."""
-    head = bytes([0x10 | len(request) >> 8, len(request) & 0xFF])
-    rest = [request[i : i + 7] for i in range(6, len(request), 7)]
-    return [(ident, head + request[:6]), *((ident, bytes([0x20 | n & 15]) + part) for n, part in enumerate(rest, 1))]
+def _both(rng: np.random.Generator, target: _Target, last: bytes) -> list[tuple[int, bytes]]:
+    from hil.uds.server import key_of as uds_key
+
+    if not rng.integers(0, 60):  # the ECU asks for RUN or not, or is not there for a while
+        target.ecu.set_demand(70.0, mode_request=int(rng.integers(0, 2)))
+        target.away = int(rng.choice([0, 0, 0, 30, 1200]))
+    if not rng.integers(0, 100):  # nobody sends: a check is done, a fault heals, a session ends
+        for _ in range(int(rng.choice([100, 300, 5200], p=[0.7, 0.27, 0.03]))):
+            target.tick([])
+    if rng.integers(0, 2):  # an answer is waited for
+        return []
+    return rules_of(Tool(rng, target.slave, target.server, uds_key, target.keys))
 
 
 def _resident() -> float:
@@ -205,13 +237,14 @@ def fuzz_tools(
     limits: np.ndarray,
     recovery: int = RECOVERY,
 ) -> ToolCampaign:
-    """Send hostile ``frames`` of ``protocol`` ("xcp", "uds"); the same seed gives the same frames.
+    """Send hostile ``frames`` of ``protocol`` ("xcp", "uds", or "both": sequences by rules). The same seed gives the
+    same frames.
 
     limits    what current (A) and stroke demand (m) must not exceed, beside the calibration's own limits; inf: nothing
     recovery  ticks within which RUN must be back
     """
     campaign = ToolCampaign(protocol, seed)
-    make = _xcp if protocol == "xcp" else _uds
+    make = {"xcp": _xcp, "uds": _uds, "both": _both}[protocol]
     settled = 0.0
     while campaign.frames < frames and not campaign.failure:
         rng = np.random.default_rng([seed, campaign.episodes])
@@ -233,6 +266,7 @@ def fuzz_tools(
                 target.tick([])
                 campaign.ticks += 1
             target.flash()
+            target.away = 0
             target.ecu.set_demand(70.0, mode_request=1)
             for _ in range(recovery):
                 target.tick([])

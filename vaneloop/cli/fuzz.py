@@ -53,8 +53,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--replay", metavar="F", help="run this candump log from switch-on instead of random frames")
     parser.add_argument(
         "--tool",
-        choices=("xcp", "uds"),
-        help="hostile commands of a tool instead: XCP (docs/xcp.md), UDS (docs/uds.md)",
+        choices=("xcp", "uds", "both"),
+        help="hostile commands of a tool instead: XCP (docs/xcp.md), UDS (docs/uds.md), sequences of both by rules",
     )
     parser.add_argument(
         "--current-limit",
@@ -80,6 +80,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
   vaneloop fuzz --frames 10000000 --seed 1 --out fuzz_failure.log
   vaneloop fuzz --replay fuzz_failure.log
   vaneloop fuzz --tool xcp --frames 100000
+  vaneloop fuzz --tool both --frames 100000
 
 exit codes: 0 everything held, 1 something did not, 2 bad input"""
     terminal.add_output_options(parser)
@@ -148,8 +149,8 @@ def _tool(args: argparse.Namespace) -> int:
     for option in ("replay", "model", "tables", "plant", "controller"):
         if getattr(args, option, None):
             raise InputError(f"--{option} is not for --tool")
-    if args.tool == "uds":
-        needs("--tool uds", "isotp")
+    if args.tool != "xcp":
+        needs(f"--tool {args.tool}", "isotp")
     with terminal.progress_bar(args, "frames") as progress:
         c = fuzz_tools.fuzz_tools(
             args.tool, args.frames, args.seed, progress,
