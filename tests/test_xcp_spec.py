@@ -29,7 +29,7 @@ from controller.records import FAULTS, INPUTS, SCALARS, STATE
 from hil.bus.frames import ECU_DEMAND, ERROR, EXTENDED, FD, PREPARED, REMOTE, SEEDS, decode_demand, encode_demand, word0
 from hil.calibrate import Attended, Memory, Slave, elements, master, prepare
 from hil.calibrate.a2l import a2l_of
-from hil.calibrate.daq import Daq
+from hil.calibrate.daq import Daq, Entry
 from hil.calibrate.elements import Element
 from hil.calibrate.errors import Refusal
 from hil.calibrate.lock import Lock
@@ -877,8 +877,7 @@ def test_selected_lists_are_started_and_stopped_together() -> None:
 
 def test_where_one_selected_list_is_not_complete_none_is_started() -> None:
     s = listed(1, 1)
-    all_of(s, "DE 02 00 00", "DE 02 01 00", "E2 00 01 00 00 00")
-    s.daq.lists[1].tables = [[None]]
+    all_of(s, "DE 02 00 00", "DE 02 01 00", "D3 00 01 00 00 01")
     assert asked(s, "DD 01") == "FE 2A" and runs(s) == [1, 1]
 
 
@@ -1013,7 +1012,7 @@ def test_inputs_are_given_with_the_list_s_last_frame_if_all_have_come(extra: int
 
 def test_two_inputs_of_one_table_stand_side_by_side() -> None:
     s = stim("n_dem", "x_lvdt")
-    s.daq.lists[1].tables[1] += [(4, 1, INPUT + 4)]
+    s.daq.lists[1].tables[1] += [Entry(4, 1, INPUT + 4, 6, 4)]
     assert asked(s, "DE 01 01 00") == "FF 00"
     s.command(frame(0, 81.0))
     s.command(frame(1, 0.25))
@@ -1393,7 +1392,7 @@ def test_while_a_check_waits_no_command_is_taken_and_its_answer_comes_with_the_e
     for command in ("EB 01 00 01", "FD"):
         service.hear(0x6E0, bytes.fromhex(command))
     service.before(0)
-    assert [service.work() for _ in range(3)] == [1, 0, 0]
+    assert [service.work() for _ in range(3)] == [8, 0, 0], "a page takes all of a tick's work"
     assert service.after(0) is None and s.waiting and len(service._in) == 1
     held.result = (1, "")
     desk.before(1, 1)
@@ -1409,7 +1408,7 @@ def test_measurements_come_behind_the_answers() -> None:
     service = XcpService(s)
     service.hear(0x6E0, bytes.fromhex("DE010000"))
     service.before(3)
-    assert service.work() == 1
+    assert service.work() == 8
     out = service.after(3)
     assert out is not None and [data_of(h, d)[:3].hex() for h, d in out.tolist()] == ["ff00", "000300"]
     out = service.after(4)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass, field
 from itertools import takewhile
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +27,15 @@ MEASURED, STIM = 0x10, 0x02  # modes of a list: measured with a time, or given w
 MOST_LISTS, MOST_TABLES, MOST_ENTRIES = 16, 64, 7
 MOST_FRAMES = 32  # of one tick; what is beyond is an overload: the bus carries some four
 
-Entry = tuple[int, int, int]  # size, extension, address
+
+class Entry(NamedTuple):
+    """Bytes to measure: how the tool names them, and which of `Memory.raw` has them from where on."""
+
+    size: int
+    ext: int
+    address: int
+    array: int
+    offset: int
 
 
 @dataclass
@@ -140,16 +149,17 @@ class Daq:
         if entry >= len(entries):
             raise Refusal(RANGE, f"table {table} has {len(entries)} entries")
         room = PAYLOAD - (STAMP if table == 0 else 0)
-        taken = sum(e[0] for i, e in enumerate(entries) if e is not None and i != entry)
-        if bit != 0xFF or not 1 <= size <= room - taken or self.memory.place(ext, address, size) is None:
+        taken = sum(e.size for i, e in enumerate(entries) if e is not None and i != entry)
+        where = self.memory.place(ext, address, size)
+        if bit != 0xFF or not 1 <= size <= room - taken or where is None:
             raise Refusal(RANGE, f"{size} bytes at {address:#x} (extension {ext}) cannot be measured here")
         if own.stim:
             self.stimulus.number(size, ext, address)
-        entries[entry] = size, ext, address
+        entries[entry] = Entry(size, ext, address, *where)
         self.pointer = at, table, entry + 1
 
-    def look(self) -> Entry:
-        """Return the entry under the pointer, and move on."""
+    def look(self) -> tuple[int, int, int]:
+        """Return size, extension and address of the entry under the pointer, and move on."""
         if self.pointer is None:
             raise Refusal(SEQUENCE, "SET_DAQ_PTR comes first")
         at, table, entry = self.pointer
@@ -157,12 +167,14 @@ class Daq:
         if entry >= len(entries):
             raise Refusal(RANGE, f"table {table} has {len(entries)} entries")
         self.pointer = at, table, entry + 1
-        return entries[entry] or (0, 0, 0)
+        found = entries[entry]
+        return found[:3] if found else (0, 0, 0)
 
     def clear(self, at: int) -> None:
         """Stop a list and forget what its entries are."""
         own = self._list(at)
         self._stop(own)
+        self._order()
         own.tables = [[None] * len(t) for t in own.tables]
 
     # ---- running -----------------------------------------------------------------------------------------------------
@@ -178,7 +190,7 @@ class Daq:
             raise Refusal(RANGE, f"event (={event}) must be below {len(EVENTS)}, prescaler (={prescaler}) 1 or more")
         if mode == STIM:
             for e in (e for t in own.tables for e in t if e is not None):
-                self.stimulus.number(*e)
+                self.stimulus.number(*e[:3])
         own.event, own.prescaler, own.priority, own.stim = event, prescaler, priority, mode == STIM
 
     def mode_of(self, at: int) -> tuple[int, int, int, int]:
@@ -194,12 +206,13 @@ class Daq:
             self._stop(own)
         elif what == 1:
             self._compile(own)
-            self._start(own)
+            own.running = True
         elif what == 2:
             self._compile(own)
             own.selected = True
         else:
             raise Refusal(MODE, f"mode (={what}) must be 0, 1 or 2")
+        self._order()
         return own.first_pid
 
     def start_selected(self, what: int) -> None:
@@ -211,11 +224,11 @@ class Daq:
             for own in chosen:
                 self._compile(own)
         for own in chosen:
-            own.selected = False
             if what == 1:
-                self._start(own)
+                own.running, own.selected = True, False
             else:
                 self._stop(own)
+        self._order()
 
     def _compile(self, own: DaqList) -> None:
         """Work out which byte goes where. Raises Refusal for a list that is not complete."""
@@ -225,35 +238,29 @@ class Daq:
         own.first_pid = pid = sum(len(of.tables) for of in before)
         if own.stim:
             own.raw = [b""] * len(own.tables)
-            own.inputs = [[self.stimulus.number(*e) for e in t if e is not None] for t in own.tables]
+            own.inputs = [[self.stimulus.number(*e[:3]) for e in t if e is not None] for t in own.tables]
             return
-        plan: list[tuple[int, int, int, int]] = []
-        heads = []
-        for row, table in enumerate(own.tables):
-            at = 1 + (STAMP if row == 0 else 0)
-            for entry in table:
-                assert entry is not None
-                size, ext, address = entry
-                where = self.memory.place(ext, address, size)
-                assert where is not None
-                plan += [(row, 8 * (at + i), where[0], where[1] + i) for i in range(size)]
-                at += size
-            heads.append((self.ident | at << 32, pid + row))
-        own.plan, own.heads = np.array(plan, np.int64).reshape(len(plan), 4), np.array(heads, np.int64)
-
-    def _start(self, own: DaqList) -> None:
-        own.running = True
-        self._order()
+        rows = np.array([(q, *e) for q, t in enumerate(own.tables) for e in t if e is not None], np.int64).reshape(
+            -1, 6
+        )
+        row, size = rows[:, 0], rows[:, 1]
+        begin = np.cumsum(size) - size  # of each entry, counted through all bytes of the list
+        each = np.repeat(np.arange(len(rows)), size)  # the entry of each byte
+        byte = np.arange(len(each))
+        used = np.bincount(row, size, len(own.tables)).astype(np.int64)
+        head = np.where(np.arange(len(own.tables)) == 0, 1 + STAMP, 1)  # bytes before the entries
+        place = byte + (head - np.cumsum(used) + used)[row[each]]
+        own.plan = np.stack([row[each], 8 * place, rows[each, 4], rows[each, 5] + byte - begin[each]], axis=1)
+        own.heads = np.stack([self.ident | (head + used) << 32, pid + np.arange(len(used))], axis=1)
 
     def _stop(self, own: DaqList) -> None:
         if own.stim and own.running:
             self.stimulus.clear()
         own.running = own.selected = False
-        self._order()
 
     def _order(self) -> None:
         self._running = sorted((of for of in self.lists if of.running and not of.stim), key=lambda of: -of.priority)
-        self._used = {int(i) for of in self._running for i in of.plan[:, 2]}
+        self._used = set(np.concatenate([of.plan[:, 2] for of in self._running]).tolist()) if self._running else set()
 
     @property
     def running(self) -> bool:

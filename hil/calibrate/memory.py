@@ -181,16 +181,18 @@ class Memory:
             raise Refusal(DENIED if known else RANGE, f"{address:#x} must be in the calibration")
         if self.xcp_page != WORKING:
             raise Refusal(PROTECTED, "the reference page cannot be written")
-        half = {key: (bytearray(raw), mask) for key, (raw, mask) in self._half.items()}
+        half: dict[int, tuple[bytearray, int]] = {}  # what these bytes leave incomplete
         values: dict[int, float] = {}
         for i, byte in enumerate(data, first):
             number, at = divmod(i, width)
-            raw, mask = half.get(2 * number + ext, (bytearray(width), 0))
+            key = 2 * number + ext
+            raw, mask = half.get(key) or self._half.get(key, (bytes(width), 0))
+            raw = bytearray(raw)
             raw[at] = byte
             mask |= 1 << at
-            half[2 * number + ext] = raw, mask
+            half[key] = raw, mask
             if mask == (1 << width) - 1:
-                del half[2 * number + ext]
+                del half[key]
                 values[number] = float(np.frombuffer(bytes(raw), np.float32 if ext == SHORT else np.float64)[0])
         forgotten = [2 * number + ext for number in values]
 
@@ -199,7 +201,7 @@ class Memory:
                 self._half.pop(key, None)
             if task is not None:
                 task.finish(result)
-            self._half = half
+            self._half |= half
 
         try:
             task = self.change(values)
@@ -301,7 +303,9 @@ class Memory:
         """Copy the reference page over the working page, whole: now, or with the task returned. Raises `Refusal`."""
         if (source, target) != (REFERENCE, WORKING):
             raise Refusal(PROTECTED if target == REFERENCE else NO_PAGE, "only page 1 can be copied to page 0")
-        return self.change(dict(enumerate(self.pages[REFERENCE].tolist())))
+        now = self.live() if self.ecu_page == WORKING else self.pages[WORKING]
+        other = np.flatnonzero(self.pages[REFERENCE] != now)
+        return self.change({int(i): float(self.pages[REFERENCE][i]) for i in other})
 
     def save(self, folder: Path) -> Task:
         """The task that writes the working page, as it is now, as tables that ``--tables`` takes."""

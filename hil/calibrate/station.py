@@ -22,6 +22,7 @@ __all__ = ["MASTER", "SLAVE", "Attended", "Service", "XcpService", "replay_atten
 
 MASTER, SLAVE = 0x6E0, 0x6E1  # CAN identifiers of XCP: commands, answers with measurements
 MOST_WORK = 8  # before one tick, of all services together: a command of XCP is 1
+HEAVY = (0xDD, 0xDE, 0xE4, 0xEB)  # starts or selects lists, copies or switches a page: a tick's work
 MOST_WAITING = 256  # commands kept, and answers beyond which no further command is carried out
 MOST_ANSWERS = 4  # sent after one tick: about what the bus carries
 _KIND = EXTENDED | REMOTE | ERROR | FD | NOTE
@@ -125,8 +126,9 @@ class XcpService:
         """Carry out a command; a tool that floods the slave waits for its answers."""
         if not self._in or self.slave.waiting or len(self._out) > MOST_WAITING:
             return 0
-        self._out += self.slave.command(self._in.popleft())
-        return 1
+        command = self._in.popleft()
+        self._out += self.slave.command(command)
+        return MOST_WORK if command[:1] and command[0] in HEAVY else 1
 
     def after(self, k: int) -> np.ndarray | None:
         """Return answers and measurements."""
@@ -144,7 +146,7 @@ class Attended:
 
     told  a tick's frames say when work that was prepared takes effect: in real time (`heed`), and in a record of it.
           False: with the tick after it was asked for
-    worked  work on tools' frames before the last tick
+    worked  work on tools' frames before the last tick; the last one may go beyond `MOST_WORK`
     """
 
     def __init__(self, node: Node, *services: Service, told: bool = False):
