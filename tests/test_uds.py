@@ -179,7 +179,9 @@ def test_trouble_codes_are_kept_over_a_restart(tmp_path: Path) -> None:
     entry = again.entry(CODES["demand_stale"].number)
     assert entry is not None and entry.failures == 1 and len(entry.first) == 4 * len(SIGNALS)
     assert entry.status & 0x20 and entry.status & 0x40 and not entry.status & 1
-    for text in ("", "[]", '{"codes": 3}', kept[-1].replace('"failures": 1', '"failures": 999'), "\x00" * 99):
+    for text in ("", "[]", '{"codes": 3}', kept[-1].replace('"failures": 1', '"failures": 999'), "\x00" * 99,
+                 kept[-1].replace('"failures": 1', '"failures": Infinity'),
+                 kept[-1].replace('keys": 0', 'keys": 256'), kept[-1].replace('keys": 0', 'keys": -1')):  # fmt: skip
         file.write_text(text)
         with pytest.raises(InputError, match="is no memory of trouble codes"):
             TroubleMemory.load(file)

@@ -1002,6 +1002,8 @@ def test_what_the_routines_tell_of_two_ends() -> None:
         sweep = Sweep(SimpleNamespace(), 0, 2, (0.0, 0.0), (0.04, span), 0.0)  # type: ignore[arg-type]
         assert struct.unpack(">f", sweep.result(0x0202)[1:5])[0] == pytest.approx(wanted, rel=1e-3), span
         assert sweep.result(0x0202)[0] == 2
+    sweep = Sweep(SimpleNamespace(), 0, 2, (0.004, 0.005))  # type: ignore[arg-type]
+    assert sweep.result(0x0202) == b"\2" + bytes(8), "ended before the other end"
 
 
 # ---- a calibration file ----------------------------------------------------------------------------------------------

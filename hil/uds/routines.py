@@ -86,12 +86,14 @@ class Sweep:
         """What the tool is told: the state, then numbers of single precision, big-endian, mm.
 
         Of the sweep: lowest and highest stroke, largest error of the servo. Of the two-point calibration: the LVDT's
-        gain (-) and offset (mm) against the stem potentiometer through the table of angles.
+        gain (-) and offset (mm) against the stem potentiometer through the table of angles. What was not measured is 0.
         """
         if routine == SWEEP:
             return bytes([self.state]) + struct.pack(">3f", self.low[0] * 1e3, self.high[0] * 1e3, self.worst * 1e3)
         span = self.high[1] - self.low[1]
-        gain = (self.high[0] - self.low[0]) / span if abs(span) > 1e-3 else 0.0
+        if self.high == (0.0, 0.0) or abs(span) <= 1e-3:  # an end was not reached
+            return bytes([self.state]) + bytes(8)
+        gain = (self.high[0] - self.low[0]) / span
         return bytes([self.state]) + struct.pack(">2f", gain, (self.low[0] - gain * self.low[1]) * 1e3)
 
 

@@ -199,7 +199,7 @@ class TroubleMemory:
             out.texts = {str(k)[:4]: str(v)[:32] for k, v in data["texts"].items()}
         except OSError as e:
             raise InputError(f"{file}: cannot be read ({e.strerror})") from None
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError, binascii.Error) as e:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError, binascii.Error) as e:
             raise InputError(f"{file}: is no memory of trouble codes ({type(e).__name__}: {e})"[:200]) from None
         out.new_cycle()
         return out
