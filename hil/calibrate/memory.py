@@ -186,8 +186,8 @@ class Memory:
         for i, byte in enumerate(data, first):
             number, at = divmod(i, width)
             key = 2 * number + ext
-            raw, mask = half.get(key) or self._half.get(key, (bytes(width), 0))
-            raw = bytearray(raw)
+            kept, mask = half.get(key) or self._half.get(key, (bytearray(width), 0))
+            raw = bytearray(kept)
             raw[at] = byte
             mask |= 1 << at
             half[key] = raw, mask

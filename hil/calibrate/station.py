@@ -184,8 +184,8 @@ class Attended:
                 noted = data
             elif head == SEEDS:
                 theirs.append(i)
-                for service in self.services:
-                    service.lock.number = data
+                for each in self.services:
+                    each.lock.number = data
             elif (service := self._by_ident.get(head & IDENT_MASK)) is not None:
                 theirs.append(i)
                 if head & _KIND == 0:
