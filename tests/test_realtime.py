@@ -251,7 +251,7 @@ def test_a_pause_drops_the_queue_and_is_a_fault_that_the_bus_sees_and_the_record
 class Forger(Queue):
     """The same, with frames of somebody who knows how notes look among the others, at random moments, of every kind."""
 
-    HEADS = [note & frames.HEAD_MASK | kind for note in (frames.PAUSE, frames.PREPARED, frames.PAUSE + 2)
+    HEADS = [note & frames.HEAD_MASK | kind for note in (frames.PAUSE, frames.PREPARED, frames.FRESHNESS, frames.SEEDS)
              for kind in (0, frames.FD, frames.REMOTE)]  # fmt: skip
     HEADS += [8 << 32 | frames.ERROR | ident for ident in (0x004, 0x080, 0x0A0, 0x100)] + [8 << 32 | 0x0A0]
 

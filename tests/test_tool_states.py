@@ -21,7 +21,6 @@ pytest.importorskip("isotp")
 
 from controller import Calibration, load_calibration
 from controller.records import INPUTS, SCALARS
-from hil.bus.frames import HEAD_MASK, noted
 from hil.calibrate import Attended, Memory, Slave
 from hil.calibrate.slave import key_of as xcp_key
 from hil.calibrate.station import MASTER, XcpService, replay_attended, row_of
@@ -573,14 +572,14 @@ def test_a_recorded_session_with_keys_is_repeated_with_the_seeds_that_it_had() -
         frames = [*ecu.tick(ours).tolist(), *(list(row_of(*f)) for f in tool)]
         rows[: len(frames)] = np.array(frames, np.int64).reshape(-1, 2)
         n = node.heed(rows, len(frames))
-        taken += [(k, row) for row in (rows[:n] & [HEAD_MASK, -1]).tolist()]
+        taken += [(k, row) for row in rows[:n].tolist()]
         out = node.tick(rows, n)
         sent += [(k, row) for row in out.tolist()]
         ours = out[out[:, 0] & 0x7FF < 0x100].copy()
     assert opened >= {("xcp", True), ("uds", True)}
     other, *_ = attended(seed=3)  # it has a number of its own, until the note comes
     at, received = np.array([k for k, _ in taken]), np.array([row for _, row in taken], np.int64)
-    again_at, again = replay_attended(other, at, noted(received), 1200)
+    again_at, again = replay_attended(other, at, received, 1200)
     assert again_at.tolist() == [k for k, _ in sent] and again.tolist() == [row for _, row in sent]
     assert other.node.fingerprint() == node.node.fingerprint() and other.lost == node.lost
     assert any(n for counts in other.lost.values() for n in counts.values()), "something was dropped"
