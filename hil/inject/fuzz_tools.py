@@ -209,7 +209,7 @@ def _both(rng: np.random.Generator, target: _Target, last: bytes) -> list[tuple[
     if not rng.integers(0, 60):  # the ECU asks for RUN or not, or is not there for a while
         target.ecu.set_demand(70.0, mode_request=int(rng.integers(0, 2)))
         target.away = int(rng.choice([0, 0, 0, 30, 1200]))
-    if not rng.integers(0, 100):  # nobody sends: a check is done, a fault heals, a session ends
+    if not rng.integers(0, 300):  # nobody sends: a check is done, a fault heals, a session ends
         for _ in range(int(rng.choice([100, 300, 5200], p=[0.7, 0.27, 0.03]))):
             target.tick([])
     if rng.integers(0, 2):  # an answer is waited for
