@@ -35,7 +35,8 @@ WORDS = {
     "duckdb": ["fleet report run", "campaign plan.toml --out run"],
     "ruptures": ["fleet report run"],
     "distributed": ["campaign plan.toml --out run --on slurm", "fleet run . --out run --on tcp://127.0.0.1:1"],
-    "cryptography": ["campaign plan.toml --out run --on slurm", "fleet run . --out run --on slurm"],
+    "cryptography": ["campaign plan.toml --out run --on slurm", "fleet run . --out run --on slurm",
+                     "run --bus lockstep --duration 1 --secoc env", "ecu --bus local --secoc env"],
     "nicegui": ["web --no-open"],
     "tsdownsample": ["web --no-open"],
     "fmpy": ["run --bus lockstep --duration 1 --plant plant.fmu"],
@@ -58,7 +59,7 @@ def test_a_command_without_its_extra_says_in_one_line_what_to_install(
     monkeypatch.setitem(sys.modules, module, None)
     assert main(words.split()) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    (extra,) = (e for e, brought in EXTRAS.items() if module in brought)
+    extra = "secoc" if "--secoc" in words else next(e for e, brought in EXTRAS.items() if module in brought)
     assert line.endswith(f" needs {EXTRAS[extra][module]}, which is not installed: pip install 'vaneloop[{extra}]'")
     assert [f.name for f in tmp_path.iterdir()] == ["run.mf4"], "files are left behind"
 
@@ -70,7 +71,7 @@ def test_what_asks_for_a_package_names_it_and_its_extra(
     assert package in names(PROJECT["optional-dependencies"][extra])
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(InputError, match=rf"^A thing needs {package}, .*: pip install 'vaneloop\[{extra}\]'$"):
-        needed("A thing", module)
+        needed("A thing", module, extra)
 
 
 def test_no_log_is_written_as_mdf4_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,7 +48,7 @@ def read_key(source: str) -> bytes:
     """Return the 16 bytes of the key: in a file that only its owner may read, or for ``env`` in ``VANELOOP_SECOC_KEY``,
     as 32 hexadecimal digits. Raises InputError, which never shows what it found.
     """
-    needs("--secoc", "cryptography")
+    needs("--secoc", "cryptography", extra="secoc")
     if source == "env":
         where, text = KEY_VARIABLE, os.environ.get(KEY_VARIABLE)
         if text is None:
@@ -82,8 +82,9 @@ class Authenticator:
     """MACs under one key (16 bytes)."""
 
     def __init__(self, key: bytes):
-        aes = needed("authentication (SecOC)", "cryptography.hazmat.primitives.ciphers.algorithms").AES
-        self._begun = needed("authentication (SecOC)", "cryptography.hazmat.primitives.cmac").CMAC(aes(key))
+        words = "authentication (SecOC)"
+        aes = needed(words, "cryptography.hazmat.primitives.ciphers.algorithms", "secoc").AES
+        self._begun = needed(words, "cryptography.hazmat.primitives.cmac", "secoc").CMAC(aes(key))
 
     def mac(self, ident: int, data: int, freshness: int) -> bytes:
         """Return the 16 bytes of the MAC of a frame (word 1) at a freshness value."""

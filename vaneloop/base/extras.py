@@ -28,19 +28,19 @@ def is_there(module: str) -> bool:
     return importlib.util.find_spec(module.partition(".")[0]) is not None
 
 
-def needs(thing: str, *modules: str) -> None:
+def needs(thing: str, *modules: str, extra: str | None = None) -> None:
     """Raise InputError where ``thing``, which a user has asked for, needs a package that is not installed.
 
-    The line names the thing, what is missing and the extra that brings it.
+    The line names the thing, what is missing and the extra that brings it: ``extra``, where several do.
     """
     for module in modules:
         if not is_there(module):
-            extra = next(e for e, brought in EXTRAS.items() if module in brought)
-            package = EXTRAS[extra][module]
+            extra = extra or next(e for e, brought in EXTRAS.items() if module in brought)
+            package = EXTRAS[extra][module.partition(".")[0]]
             raise InputError(f"{thing} needs {package}, which is not installed: pip install 'vaneloop[{extra}]'")
 
 
-def needed(thing: str, module: str) -> Any:
+def needed(thing: str, module: str, extra: str | None = None) -> Any:
     """The module, imported; InputError as `needs` where it is not installed."""
-    needs(thing, module)
+    needs(thing, module, extra=extra)
     return importlib.import_module(module)
