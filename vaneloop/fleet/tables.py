@@ -45,6 +45,7 @@ _FIELDS = (
     ("missed", "not_observable", _MISSED, ("effect", "stage"), ()),
     ("unseen", "stages", _UNSEEN, ("stage", "verdict"), ()),
 )  # fmt: skip
+_ANSWER = json.dumps({"duration_s": "DOUBLE"} | {field: json.loads(shape) for _, field, shape, *_ in _FIELDS})
 _NEEDED = ("neutral", "table")  # numbers that must be there; others may be null, where a log does not tell them
 _DAMAGED = "its answer is damaged; vaneloop fleet run --retry does it anew"
 TAKEN = 64 << 20  # bytes of answers that are looked into at once
@@ -137,26 +138,29 @@ def _batches(folder: Folder) -> Iterator[pa.Table]:
 def _take(db: duckdb.DuckDBPyConnection, batch: pa.Table) -> None:
     """Put what came of some logs into the database."""
     db.register("_part", batch)
-    wrong = " OR ".join(f"coalesce(json_type(answer, '$.{field}'), 'NULL') NOT IN ('ARRAY', 'NULL')"
-                        for _, field, *_ in _FIELDS)  # fmt: skip
     known = ", ".join(f"'{s}'" for s in STATUSES)
-    db.execute(
-        "CREATE OR REPLACE TEMP TABLE part AS SELECT key, status, reason, verdict, CASE WHEN json_valid(answer) THEN "
-        "CASE WHEN json_type(answer) = 'OBJECT' THEN answer END END AS answer FROM _part"
+    fields = ", ".join(f"'$.{field}'" for _, field, *_ in _FIELDS)
+    wrong = " OR ".join(f"coalesce(kinds[{k}], 'NULL') NOT IN ('ARRAY', 'NULL')" for k in range(2, len(_FIELDS) + 2))
+    db.execute(  # a text that is no JSON must be gone before it is looked into
+        "CREATE OR REPLACE TEMP TABLE valid AS SELECT * REPLACE (CASE WHEN json_valid(answer) THEN answer END AS answer"
+        ") FROM _part"
     )
     db.unregister("_part")
     db.execute(
-        f"INSERT INTO results SELECT key, CASE WHEN status IS NULL OR status NOT IN ({known}) OR status = 'done' AND "
-        f"(answer IS NULL OR verdict IS NULL) OR answer IS NOT NULL AND ({wrong}) THEN 'damaged' ELSE status END, "
-        "coalesce(reason, ''), verdict, CASE WHEN isfinite(TRY_CAST(answer ->> '$.duration_s' AS "
-        "DOUBLE)) THEN TRY_CAST(answer ->> '$.duration_s' AS DOUBLE) END FROM part"
+        "CREATE OR REPLACE TEMP TABLE part AS SELECT key, status, reason, verdict, "
+        f"json_type(answer, ['$', {fields}]) AS kinds, from_json(answer, '{_ANSWER}') AS said FROM valid"
     )
-    for table, field, shape, texts, numbers in _FIELDS:
+    db.execute(
+        f"INSERT INTO results SELECT key, CASE WHEN status IS NULL OR status NOT IN ({known}) OR status = 'done' AND "
+        f"(kinds IS NULL OR verdict IS NULL) OR kinds IS NOT NULL AND (kinds[1] <> 'OBJECT' OR {wrong}) THEN 'damaged' "
+        "ELSE status END, coalesce(reason, ''), verdict, CASE WHEN isfinite(said.duration_s) THEN said.duration_s END "
+        "FROM part"
+    )
+    for table, field, _, texts, numbers in _FIELDS:
         good = [f"x.{c} IS NOT NULL" for c in texts]
         good += [f'coalesce(isfinite(x."{c}"), {str(c not in _NEEDED).lower()})' for c in numbers]
         db.execute(f"INSERT INTO raw_{table} SELECT key, x.*, x IS NOT NULL AND {' AND '.join(good)} FROM (SELECT key, "
-                   f"unnest(from_json(answer -> '$.{field}', '{shape}')) AS x FROM part WHERE status = 'done' AND "
-                   f"json_type(answer, '$.{field}') = 'ARRAY')")  # fmt: skip
+                   f"unnest(said.{field}) AS x FROM part WHERE status = 'done')")  # fmt: skip
 
 
 def database() -> duckdb.DuckDBPyConnection:
