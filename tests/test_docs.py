@@ -31,7 +31,12 @@ from tests.quotes import absent, lines_of, tokens
 from vaneloop.base import terminal
 from vaneloop.cli.main import COMMANDS, main
 
-PAGES = ["README.md", "CONTRIBUTING.md", *sorted(str(p.relative_to(ROOT)) for p in (ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    "README.md",
+    "CONTRIBUTING.md",
+    "SECURITY.md",
+    *sorted(str(p.relative_to(ROOT)) for p in (ROOT / "docs").rglob("*.md")),
+]
 EXAMPLE = "examples/hidden_effect.parquet"
 
 # words of a page's commands and snippets -> what is run instead, and why

@@ -10,11 +10,13 @@ Rows are in the order of path, so that two runs over the same logs give the same
 
 from __future__ import annotations
 
+import atexit
 import json
-import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -163,13 +165,19 @@ def _take(db: duckdb.DuckDBPyConnection, batch: pa.Table) -> None:
                    f"unnest(said.{field}) AS x FROM part WHERE status = 'done')")  # fmt: skip
 
 
+@cache
+def _spilled() -> str:
+    """A folder of this process alone for what does not fit into memory; it goes with the process."""
+    place = tempfile.mkdtemp(prefix="vaneloop-fleet-")
+    atexit.register(shutil.rmtree, place, ignore_errors=True)
+    return place
+
+
 def database() -> duckdb.DuckDBPyConnection:
-    """A database in memory; what does not fit goes to the system's folder for temporary files, not to where the user
-    stands.
-    """
+    """A database in memory; what does not fit goes to a private folder, not to where the user stands."""
     import duckdb
 
-    place = str(Path(tempfile.gettempdir()) / f"vaneloop-fleet-{os.getpid()}")
+    place = _spilled()
     alone = dict.fromkeys(("autoinstall_known_extensions", "autoload_known_extensions"), "false")
     db = duckdb.connect(config={"memory_limit": MEMORY, "threads": "2", "temp_directory": place, **alone})
     db.execute("SET enable_progress_bar = false")
