@@ -10,7 +10,7 @@ import pytest
 from tests.conftest import ROOT
 
 WORDS, COLUMNS = 38, 160
-PAGES = ["README.md", *sorted(str(p.relative_to(ROOT)) for p in (ROOT / "docs").rglob("*.md"))]
+PAGES = ["README.md", "SECURITY.md", *sorted(str(p.relative_to(ROOT)) for p in (ROOT / "docs").rglob("*.md"))]
 
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\([^()\s]*(?:\([^()]*\)[^()\s]*)*\)")
 _BEGINS = re.compile(r"\s*(?:[-*+] |\d+\. |#|\||>|!!!|\?\?\?|:\s)")
