@@ -147,6 +147,7 @@ def killed(place: Path, kills: int, logs: int, seed: int) -> dict[str, Any]:
     """
     import psutil
 
+    import tests.fleet_jobs  # noqa: F401 (the stand-in is a kind of work)
     from vaneloop.fleet import sources, state, tables
     from vaneloop.fleet.folder import Folder
     from vaneloop.fleet.journal import lines
