@@ -476,6 +476,18 @@ def test_live_data_are_the_firmware_s_in_the_units_of_the_table() -> None:
     assert bench.server.trouble.entries[0].first == struct.pack(">9f", *values)
 
 
+def test_what_single_precision_cannot_hold_is_infinite() -> None:
+    """XCP may give such a stroke (STIM); in mm it is beyond the largest single."""
+    s = server()
+    s.node.loop.fed.x_lvdt, s.node.loop.given.faults = -3e38, 4.0
+    assert asked(s, "22 20 04 20 07") == "62 20 04 FF 80 00 00 20 07 40 80 00 00"
+    s.after(0)
+    assert s.trouble.entries[2].first[16:20] == b"\xff\x80\0\0", "the freeze frame"
+    sweep = Sweep(SimpleNamespace(), 0, 2, (-3e38, 0.005), (3e38, 0.037), 3e38)  # type: ignore[arg-type]
+    assert sweep.result(0x0201) == b"\2" + bytes.fromhex("FF800000 7F800000 7F800000")
+    assert sweep.result(0x0202) == b"\2" + bytes.fromhex("7F800000 FF800000")
+
+
 def test_identifiers_that_stand_still() -> None:
     s = unlocked()
     crc_of = zlib.crc32(s.memory.live().tobytes())

@@ -6,7 +6,6 @@ firmware's limits and monitors hold as ever, and whoever ends the routine has th
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,7 +14,7 @@ from controller.records import STANDBY
 from hil.bus.frames import with_demand
 from hil.loop.node import Node
 
-__all__ = ["CLEAR_LEARNED", "LVDT", "SWEEP", "Sweep", "clear_learned"]
+__all__ = ["CLEAR_LEARNED", "LVDT", "SWEEP", "Sweep", "clear_learned", "singles"]
 
 SWEEP, LVDT, CLEAR_LEARNED = 0x0201, 0x0202, 0x0203
 LOW, HIGH, RATE = 45.0, 104.0, 12.0  # %, %/s: demands of the sweep, over nearly the whole stroke
@@ -23,6 +22,12 @@ HOLD = 1500  # ticks at each end
 RAMP = round((HIGH - LOW) / RATE * 1000)  # ticks of the way between them
 RUNNING, DONE, ABORTED = 1, 0, 2
 _LEARNED = ("offset", "width", "proved_offset", "proved_width", "learned_up", "learned_down", "trusted")
+
+
+def singles(*values: float) -> bytes:
+    """Numbers in single precision, big-endian; what is beyond it is infinite."""
+    with np.errstate(over="ignore"):
+        return np.array(values, np.float64).astype(">f4").tobytes()
 
 
 @dataclass
@@ -89,12 +94,12 @@ class Sweep:
         gain (-) and offset (mm) against the stem potentiometer through the table of angles. What was not measured is 0.
         """
         if routine == SWEEP:
-            return bytes([self.state]) + struct.pack(">3f", self.low[0] * 1e3, self.high[0] * 1e3, self.worst * 1e3)
+            return bytes([self.state]) + singles(self.low[0] * 1e3, self.high[0] * 1e3, self.worst * 1e3)
         span = self.high[1] - self.low[1]
         if self.high == (0.0, 0.0) or abs(span) <= 1e-3:  # an end was not reached
             return bytes([self.state]) + bytes(8)
         gain = (self.high[0] - self.low[0]) / span
-        return bytes([self.state]) + struct.pack(">2f", gain, (self.low[0] - gain * self.low[1]) * 1e3)
+        return bytes([self.state]) + singles(gain, (self.low[0] - gain * self.low[1]) * 1e3)
 
 
 def clear_learned(node: Node) -> bool:

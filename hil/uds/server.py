@@ -47,7 +47,6 @@ SIGNALS = {
     0x2004: ("x_lvdt", "mm"), 0x2005: ("i_cmd", "mA"), 0x2006: ("state", "-"), 0x2007: ("faults", "-"),
     0x2008: ("vigv", "deg"),
 }  # fmt: skip
-_FRAME = struct.Struct(f">{len(SIGNALS)}f")
 TEXTS = {0xF187: "VGV-1", 0xF18C: "VANELOOP-0001", 0xF195: "1.0", 0xF197: "variable guide vanes"}
 WRITABLE = {0xF198: 16, 0xF199: 8}  # repair shop, date of the last programming: longest text
 
@@ -188,7 +187,7 @@ class Server:
 
     def _freeze(self) -> bytes:
         now = self._signals()
-        return _FRAME.pack(*(now[name] for name, _ in SIGNALS.values()))
+        return routines.singles(*(now[name] for name, _ in SIGNALS.values()))
 
     def _signals(self) -> dict[str, float]:
         """The live signals after the last tick."""
@@ -350,7 +349,7 @@ class Server:
 
     def _value(self, ident: int, now: dict[str, float]) -> bytes:
         if ident in SIGNALS:
-            return struct.pack(">f", now[SIGNALS[ident][0]])
+            return routines.singles(now[SIGNALS[ident][0]])
         if ident in TEXTS:
             return TEXTS[ident].encode()
         if ident in WRITABLE:
