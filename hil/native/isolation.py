@@ -25,9 +25,9 @@ import sys
 import tempfile
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from hashlib import sha256
-from multiprocessing.pool import ExceptionWithTraceback
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, TypeVar, cast
 
@@ -60,6 +60,10 @@ class ControllerFailed(RuntimeError):
     """A controller of the user's own ended its process: one line with tick, time, reason and last inputs."""
 
 
+class RemoteTraceback(Exception):
+    """Where an exception was raised in the process with the controller: its traceback, as text."""
+
+
 def isolated(task: Callable[[], T], save_crash: str | None = None, patience: float = PATIENCE) -> T:
     """Call ``task`` in a process of its own and return its answer, which must be picklable; its exceptions come, too.
 
@@ -76,9 +80,9 @@ def isolated(task: Callable[[], T], save_crash: str | None = None, patience: flo
         answer = _read_answer(folder, end)
         if answer is None:
             raise ControllerFailed(_failure(folder, end, save_crash))
-        good, what = answer
+        good, what, lines = answer
         if not good:
-            raise what
+            raise what from RemoteTraceback(lines)
         return cast("T", what)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -157,9 +161,9 @@ def _read_end(folder: Path) -> _End:
         return _End()
 
 
-def _read_answer(folder: Path, end: _End) -> tuple[bool, Any] | None:
-    """The task's answer: whether it is good, and it or an exception; None where the process did not end by itself, or
-    wrote none that is whole.
+def _read_answer(folder: Path, end: _End) -> tuple[bool, Any, str] | None:
+    """The task's answer: whether it is good, it or an exception, and that one's traceback; None where the process did
+    not end by itself, or wrote none that is whole.
     """
     if end.child == 0 or end.why or end.status != 0:
         return None
@@ -168,7 +172,7 @@ def _read_answer(folder: Path, end: _End) -> tuple[bool, Any] | None:
     except OSError:
         return None
     digest, content = data[:_DIGEST], data[_DIGEST:]
-    return cast("tuple[bool, Any]", pickle.loads(content)) if sha256(content).digest() == digest else None
+    return cast("tuple[bool, Any, str]", pickle.loads(content)) if sha256(content).digest() == digest else None
 
 
 def _failure(folder: Path, end: _End, save_crash: str | None) -> str:
@@ -180,9 +184,9 @@ def _failure(folder: Path, end: _End, save_crash: str | None) -> str:
         why = "ended what watches it, or took away its folder for temporary files"
     why = end.why or why
     if box is None:
-        overwrote = number in _SIGNALS or end.why
-        hint = "; memory that the controller overwrote may be the cause" if overwrote else ""
-        return f"the process with the controller {why}, as far as is known outside a call of it{hint}"
+        hint = "; memory that the controller overwrote may be the cause" if number in _SIGNALS else ""
+        where = "" if end.why or end.child == 0 else f", outside a call of it{hint}"
+        return f"the process with the controller {why}{where}"
     if not end.why and number in _SIGNALS:
         why += f" ({_SIGNALS[signal.Signals(number)]})"
     line = told(box, why)
@@ -356,16 +360,16 @@ def _files(descriptors: list[int]) -> dict[int, tuple[int, int] | None]:
 
 
 def _pickled(good: bool, what: Any) -> bytes:
-    """An answer as bytes; an exception with its traceback, which comes back as its cause."""
+    """An answer as bytes; an exception with its traceback."""
     if good:
-        return pickle.dumps((True, what))
+        return pickle.dumps((True, what, ""))
+    lines = "".join(traceback.format_exception(what))
     try:
-        data = pickle.dumps((False, ExceptionWithTraceback(what, what.__traceback__)))
+        data = pickle.dumps((False, what, lines))
         pickle.loads(data)
         return data
     except Exception:
-        other = RuntimeError(f"{type(what).__name__}: {what}")
-        return pickle.dumps((False, ExceptionWithTraceback(other, what.__traceback__)))
+        return pickle.dumps((False, RuntimeError(f"{type(what).__name__}: {what}"), lines))
 
 
 # ---- words -----------------------------------------------------------------------------------------------------------
