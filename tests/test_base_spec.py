@@ -8,7 +8,6 @@ import argparse
 import gc
 import json
 import math
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -330,7 +329,7 @@ def test_json_has_plain_numbers_and_null_for_none(capsys: pytest.CaptureFixture[
     written = (tmp_path / "x.json").read_text()
     assert json.loads(written) == expected and written.endswith("}\n") and written.startswith('{\n  "1"')
     assert capsys.readouterr().out == ""
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(InputError, match="cannot write"):
         terminal.write_json(said(to=str(tmp_path / "no" / "x.json")), data)
 
 
@@ -394,14 +393,11 @@ def test_a_traceback_is_printed_where_asked_for_and_a_long_complaint_cut(
     assert terminal.defect(killed).startswith("a process of the search was ended from outside")
 
 
-def test_a_reader_that_goes_ends_a_command_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
-    closed: list[bool] = []
-    monkeypatch.setattr(sys, "stderr", SimpleNamespace(close=lambda: closed.append(True)))
-
+def test_a_reader_that_goes_ends_a_command_in_silence(capsys: pytest.CaptureFixture[str]) -> None:
     def command() -> int:
-        raise BrokenPipeError
+        raise terminal.ReaderGone
 
-    assert terminal.run(command) == 0 and closed == [True]
+    assert terminal.run(command) == 0 and capsys.readouterr() == ("", "")
 
 
 def test_a_command_runs_from_its_words(capsys: pytest.CaptureFixture[str]) -> None:
@@ -445,7 +441,7 @@ def test_progress_is_drawn_on_a_terminal_alone(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr("rich.progress.Progress", Bar)
     for quiet, terminal_there in ((True, True), (False, False), (False, True)):
-        monkeypatch.setattr(sys.stderr, "isatty", lambda there=terminal_there: there, raising=False)
+        monkeypatch.setattr(terminal, "is_terminal", lambda stream, there=terminal_there: there)
         with terminal.progress_bar(said(quiet), "work") as tell:
             assert (tell is None) == (quiet or not terminal_there)
             if tell is not None:
@@ -459,16 +455,23 @@ def test_progress_is_drawn_on_a_terminal_alone(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_compiled_code_is_kept_where_that_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = compiled.cache_folder.__wrapped__
     monkeypatch.setattr(compiled, "__file__", str(tmp_path / "package" / "compiled.py"))
     monkeypatch.setattr(Path, "home", classmethod(lambda cls: cls(tmp_path / "home")))
     name = f"compiled-{kept.sources_digest()}"
-    assert compiled.cache_folder() == tmp_path / "package" / "__pycache__" / name
+    assert folder() == tmp_path / "package" / "__pycache__" / name
     refused = {tmp_path / "package" / "__pycache__"}
     monkeypatch.setattr(compiled.os, "access", lambda place, mode: place not in refused and mode == compiled.os.W_OK)
-    assert compiled.cache_folder() == tmp_path / "home" / ".cache" / "vaneloop" / name
-    (tmp_path / "home" / ".cache" / "vaneloop").rmdir()
-    (tmp_path / "home" / ".cache" / "vaneloop").write_text("no folder")
-    assert compiled.cache_folder().name == name and compiled.cache_folder().parent.name.startswith("vaneloop-")
+    cache = tmp_path / "home" / ".cache" / "vaneloop"
+    assert folder() == cache / name
+    cache.rmdir()
+    cache.write_text("no folder")
+    gone: list[Any] = []
+    monkeypatch.setattr(compiled.atexit, "register", lambda *a, **how: gone.append((*a, how)))
+    own = folder()  # of this process alone, and gone with it
+    assert own.name == name and gone == [(compiled.shutil.rmtree, str(own.parent), {"ignore_errors": True})]
+    assert own.parent.name.startswith("vaneloop-") and own.parent.stat().st_mode & 0o777 == 0o700
+    own.parent.rmdir()
 
 
 def test_code_is_kept_found_and_forgotten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -297,7 +297,7 @@ def test_a_model_file_comes_back_with_its_curves_and_words(tmp_path: Path) -> No
     assert "[curves.s.second]\n" in (tmp_path / "s.toml").read_text()
     with pytest.raises(InputError, match="curves.s: second .='t_oil'. makes it a surface"):
         load_model(tmp_path / "s.toml")
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(InputError, match="cannot write"):
         write_model(tmp_path / "no" / "m.toml", model)
 
 
