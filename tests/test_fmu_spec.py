@@ -360,6 +360,22 @@ def test_the_text_is_one_function_and_what_it_calls() -> None:
     assert "static const uint64_t g__pickle[1] = {0};" in translate(pickled, "f", "serve")
 
 
+def test_a_compiled_function_is_what_its_c_computes(gcc: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def serve(m: Any, what: int, ticks: int) -> None:
+        if what > 1:
+            m[0] = m[what] / (ticks - 2) + math.floor(m[1])  # a division by zero is infinite, no error
+
+    monkeypatch.setattr(kernel, "entry", lambda part, shape: serve)
+    (tmp_path / "f.c").write_text(source._translated("plant", Shape(1, 2, 3)))
+    subprocess.run([gcc, "-std=c99", "-fPIC", "-shared", "-o", "f.so", "f.c", "-lm"], cwd=tmp_path, check=True)
+    m, made = np.array([1.5, -2.75, -3.25, 8.0]), ctypes.CDLL(str(tmp_path / "f.so")).serve
+    place = ctypes.create_string_buffer(64)
+    words = [ctypes.c_void_p(ctypes.addressof(place)), ctypes.c_void_p(ctypes.addressof(place))]
+    for what, ticks, expected in ((1, 9, 1.5), (3, 4, 1.0), (2, 2, -math.inf), (3, 2, math.inf)):
+        assert made(*words, m.ctypes.data_as(ctypes.c_void_p), ctypes.c_int64(what), ctypes.c_int64(ticks)) == 0
+        assert m.tolist() == [expected, -2.75, -3.25, 8.0]
+
+
 # ---- the memory and its variables ------------------------------------------------------------------------------------
 
 
@@ -376,12 +392,13 @@ def test_the_arrays_lie_one_behind_the_other() -> None:
 
 
 def held(name: str) -> np.ndarray:
-    at, size = places_of(SHAPE)[name]
-    return MEMORY[at : at + int(np.prod(size))].reshape(size)
+    shape, memory = first(PLANT, CAL)
+    at, size = places_of(shape)[name]
+    return memory[at : at + int(np.prod(size))].reshape(size)
 
 
 def test_the_memory_before_the_start_is_the_machines() -> None:
-    assert (len(PLANT.vanes), CAL.table.shape[1], CAL.angles.shape[1]) == SHAPE
+    assert first(PLANT, CAL)[0] == (len(PLANT.vanes), CAL.table.shape[1], CAL.angles.shape[1])
     assert held("clock").tolist() == [0.0, 1.0, 0.0, 0.0]
     fed = dict(zip(FED, held("fed"), strict=False))
     assert fed == {

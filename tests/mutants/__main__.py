@@ -88,7 +88,7 @@ NEAREST = {
         "record logs_fuzz"
     ),
     "hil.native": "native c_reference xcp",
-    "hil.loop": "loop lanes lockstep node realtime moments replay native machines frames strategies",
+    "hil.loop": "loop_spec loop lanes lockstep node realtime moments replay native machines frames strategies",
     "hil.fmu": "fmu_spec fmu",
     "hil.calibrate": "xcp uds xcp_spec",
     "hil.uds": "uds uds_spec",
@@ -112,7 +112,7 @@ NEAREST = {
         "same_answer learn_vanes learn_lags learn_stops learn_followers learn_faint learn_screening held "
         "loggers long_logs discrepancy curves directions electromechanical readings"
     ),
-    "vaneloop.design": "design_spec design schedule spatial strategies tables tolerances",
+    "vaneloop.design": "design_spec schedule_spec design schedule spatial strategies tables tolerances",
     "vaneloop.fleet": "fleet_folder fleet_trends fleet_workers campaign_numbers fleet_report fleet_run campaign",
     "vaneloop.pages": (
         "page_parts page_outlines page design campaign fleet_report schedule strategies spatial verbs search_commands "
@@ -144,9 +144,9 @@ TARGETS += tuple(
 KERNELS = {
     "plant": "plant effects_reference linkage electromechanical tables curve_lanes",
     "plant.stages": "curve_lanes effects_reference same_answer electromechanical",
-    "hil.loop": "loop lanes lockstep node moments",
+    "hil.loop": "loop_spec loop lanes lockstep node moments",
     "vaneloop.base": "tables learn_surfaces learn_stops your_own_model",
-    "vaneloop.design": "design schedule",
+    "vaneloop.design": "design_spec schedule_spec design schedule",
     "vaneloop.discrepancy": "laws discrepancy names search_limits promise trust",
     "vaneloop.discrepancy.models": "laws learn hidden_law",
     "vaneloop.discrepancy.models.vane_stages": "same_answer learn_vanes",
