@@ -767,7 +767,8 @@ def test_results_become_tables_in_the_order_of_paths(tmp_path: Path) -> None:
         "SELECT current_setting('enable_progress_bar'), current_setting('threads'), current_setting('temp_directory')"
     )
     ((bar, threads, place),) = db.execute(progress).fetchall()
-    assert (bar, threads) == (False, 2) and place.endswith(f"vaneloop-fleet-{os.getpid()}")
+    assert (bar, threads) == (False, 2) and Path(place).name.startswith("vaneloop-fleet-")
+    assert stat.S_IMODE(os.stat(place).st_mode) == 0o700, "nobody else may read what does not fit into memory"
 
 
 # ---- which logs there are --------------------------------------------------------------------------------------------
