@@ -30,6 +30,7 @@ pytest.importorskip("duckdb", reason="the extra `fleet` is not installed")
 
 from tests.conftest import ROOT
 from vaneloop.base import terminal
+from vaneloop.base.child import python
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path as shipped
 from vaneloop.cli import options as cli_options
@@ -38,7 +39,6 @@ from vaneloop.fleet import folder, kinds, rent, worker
 from vaneloop.fleet.files import whole_json
 from vaneloop.fleet.folder import Folder
 from vaneloop.fleet.leases import Leases
-from vaneloop.fleet.reader import python
 from vaneloop.fleet.sources import find
 from vaneloop.fleet.worker import work
 

@@ -49,6 +49,7 @@ from hil.logs.record_parquet import ParquetRecord, _thrift_read, _thrift_write, 
 from hil.logs.recorder import FLUSH, Recorder, check_name, free_name, read_record
 from hil.logs.signals import encode
 from hil.logs.source import Options
+from vaneloop.base.child import python, python_module
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path as table_path
 
@@ -787,8 +788,9 @@ def test_a_child_that_fails_or_takes_too_long_has_no_answer(monkeypatch: pytest.
     monkeypatch.setattr(subprocess, "run", run)
     assert [mdf._child(json.dumps({}).encode(), s) for s in (1.0, 2.0, 3.0)] == [b"", b"said", b""]
     command, options = asked[0]
-    assert command[:2] == [sys.executable, "-c"] and options["input"] == b"{}" and options["check"] is False
-    assert options["env"]["OPENBLAS_NUM_THREADS"] == "1" and repr(str(Path(mdf.__file__).parents[2])) in command[2]
+    assert command == python("from hil.logs.mdf import serve; serve()")
+    assert options["input"] == b"{}" and options["check"] is False
+    assert options["env"]["OPENBLAS_NUM_THREADS"] == "1"
 
 
 # ---- what a receiver had ---------------------------------------------------------------------------------------------
@@ -942,7 +944,7 @@ def test_a_recorder_in_another_process_tells_how_it_ended(
     )
 
     def start(command: list[str], **options: Any) -> Any:
-        assert command == [sys.executable, "-m", "hil.logs.recorder", str(tmp_path / "a.log"), "can3"]
+        assert command == python_module("hil.logs.recorder", str(tmp_path / "a.log"), "can3")
         assert options["start_new_session"] is True
         return process
 

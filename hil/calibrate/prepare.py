@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
 from multiprocessing.connection import Connection, Pipe
@@ -23,6 +22,7 @@ from controller import load_calibration
 from hil.calibrate import elements
 from hil.calibrate.elements import Element
 from hil.calibrate.errors import BUSY, DENIED, VERIFY, Refusal
+from vaneloop.base.child import python
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import cannot_write
 
@@ -96,7 +96,7 @@ class Outside:
     def __init__(self, of: Elements):
         self._pipe, theirs = Pipe()
         code = f"from hil.calibrate.prepare import serve; serve({theirs.fileno()})"
-        words = [sys.executable, "-P", "-c", code]
+        words = python(code)
         # in a session of its own: Ctrl-C at the terminal is for the loop
         subprocess.Popen(words, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True)
         theirs.close()

@@ -27,6 +27,7 @@ from hil.fmu.description import OPTIONS
 from hil.fmu.memory import Shape, places_of
 from hil.fmu.variables import Variable
 from hil.loop.lockstep import WARM_UP
+from vaneloop.base.child import python_module
 from vaneloop.base.compiled import cache_folder
 from vaneloop.base.files import write
 
@@ -79,10 +80,8 @@ def part_source(part: str, shape: Shape) -> str:
 
 def _make_source(kept: Path, part: str, shape: Shape) -> None:
     folder = kept.parent
-    root = str(Path(__file__).parents[2])
     environment = {**os.environ, **_PLAIN, "NUMBA_CACHE_DIR": str(folder)}
-    environment["PYTHONPATH"] = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-    words = [sys.executable, "-m", "hil.fmu.source", part, *map(str, shape)]
+    words = python_module("hil.fmu.source", part, *map(str, shape))
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"the source of the FMU could not be made: {done.stderr[-2000:]}")

@@ -28,6 +28,7 @@ from hil.logs.frames import EXTENDED, Frames, FramesOfRecord, frames_of, in_orde
 from hil.logs.names import meaning
 from hil.logs.record_formats import NOTE_CHANNEL
 from hil.logs.source import Channel, LogError, Options, Series, Source, check_file, find, names_held, read_bytes
+from vaneloop.base.child import python
 from vaneloop.base.extras import needs
 from vaneloop.base.files import whole
 from vaneloop.base.signals import UNITS
@@ -158,15 +159,12 @@ def _child(request: bytes, seconds: float) -> bytes:
 
     Temporary files lie in a folder that goes with it: of a file that was not finalised the library leaves a copy there.
     """
-    code = (
-        f"import sys; sys.path.insert(0, {str(Path(__file__).parents[2])!r}); from hil.logs.mdf import serve; serve()"
-    )
     with tempfile.TemporaryDirectory(prefix="vaneloop-mdf-") as own:
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "TMPDIR": own}
         try:
             done = subprocess.run(
-                [sys.executable, "-c", code], input=request, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-                timeout=seconds, env=environment, check=False,
+                python("from hil.logs.mdf import serve; serve()"), input=request, stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL, timeout=seconds, env=environment, check=False,
             )  # fmt: skip
         except subprocess.TimeoutExpired:
             return b""

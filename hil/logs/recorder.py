@@ -41,6 +41,7 @@ from hil.logs.record_formats import (
 )
 from hil.logs.record_parquet import ParquetRecord, read_parquet
 from hil.logs.source import LogError, check_file
+from vaneloop.base.child import python_module
 from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
 from vaneloop.base.files import cannot_write
@@ -229,7 +230,7 @@ class RecorderProcess:
 
     def __init__(self, path: str | Path, channel: str = "vcan0"):
         self.path, self.lost, self.frames, self.error = check_name(path), 0, 0, ""
-        command = [sys.executable, "-m", "hil.logs.recorder", str(self.path), channel]
+        command = python_module("hil.logs.recorder", str(self.path), channel)
         # in a session of its own: Ctrl-C at the terminal is for the loop, which then ends the recording
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
         assert self._process.stdin is not None

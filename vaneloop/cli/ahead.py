@@ -18,6 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from vaneloop.base import terminal
+from vaneloop.base.child import python_module
 from vaneloop.base.files import write
 from vaneloop.base.kept import AHEAD, sources_digest
 
@@ -102,7 +103,7 @@ def main(words: list[str]) -> int:
         for jobs in JOBS:
             running = {
                 job: subprocess.Popen(
-                    [sys.executable, "-m", "vaneloop.cli.ahead", job, folder],
+                    python_module("vaneloop.cli.ahead", job, folder),
                     env=environment,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.PIPE,

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from vaneloop.base import terminal
+from vaneloop.base.child import python_module
 from vaneloop.cli.main import main as vaneloop
 
 __all__ = ["main"]
@@ -92,7 +93,7 @@ def main(words: list[str]) -> int:
         (OUT / name).unlink(missing_ok=True)
     example, hidden = (os.path.relpath(ROOT / "examples" / f) for f in ("engine_run.blf", "hidden_effect.parquet"))
     search = subprocess.Popen(
-        [sys.executable, "-m", "vaneloop.cli.demo", hidden], stdout=subprocess.PIPE, text=True, encoding="utf-8"
+        python_module("vaneloop.cli.demo", hidden), stdout=subprocess.PIPE, text=True, encoding="utf-8"
     )
     try:
         _simulate(example)

@@ -23,13 +23,13 @@ from pathlib import Path
 from typing import Any
 
 from vaneloop.base import terminal
+from vaneloop.base.child import python
 from vaneloop.base.errors import InputError
 from vaneloop.fleet.kinds import KINDS
 
-__all__ = ["Died", "NotReady", "Reader", "Stopped", "TimedOut", "python", "serve"]
+__all__ = ["Died", "NotReady", "Reader", "Stopped", "TimedOut", "serve"]
 
 SERVE = "from vaneloop.fleet.reader import serve; serve()"
-_ROOT = str(Path(__file__).parents[2])
 
 # one thread a process: several processes that each use all cores are slower than one
 ONE_THREAD = dict.fromkeys(
@@ -144,14 +144,6 @@ class Reader:
         said = self._errors.read().decode("utf-8", "replace").strip().splitlines()
         fatal = [line for line in said if line.startswith("Fatal")] or said[-1:]
         return f" ({fatal[0][:120]})" if fatal else ""
-
-
-def python(code: str, *words: str) -> list[str]:
-    """Command of a Python process of ours. It finds this VaneLoop, and no module in the folder where the user stands,
-    which may be a run folder of somebody else.
-    """
-    here = f"import sys; {_ROOT!r} in sys.path or sys.path.insert(0, {_ROOT!r}); "
-    return [sys.executable, "-P", "-c", here + code, *words]
 
 
 def _environment() -> dict[str, str]:

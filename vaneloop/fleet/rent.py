@@ -18,11 +18,11 @@ from concurrent.futures import CancelledError
 from contextlib import suppress
 from typing import IO, Any
 
+from vaneloop.base.child import python
 from vaneloop.base.errors import InputError, meant
 from vaneloop.base.extras import needed, needs
 from vaneloop.fleet.folder import Folder
 from vaneloop.fleet.leases import BEATS, Me
-from vaneloop.fleet.reader import python
 
 __all__ = ["PLACES", "hired", "known", "rent"]
 

@@ -8,13 +8,14 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
+
+from vaneloop.base.child import python_module
 
 __all__ = ["Cancelled", "Job", "Spare", "WorkError", "Worker"]
 
@@ -59,11 +60,9 @@ Started = tuple[subprocess.Popen[bytes], Connection]
 def _launch(module: str, *more: str) -> Started:
     """Start a process of ours that answers over a socket."""
     ours, theirs = socket.socketpair()
-    # -P: nothing is imported from the folder in which the server happens to run
-    words = [sys.executable, "-P", "-m", module, str(theirs.fileno()), *more]
     process = subprocess.Popen(
-        words, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True,
-        env={**os.environ, **ONE_THREAD},
+        python_module(module, str(theirs.fileno()), *more), pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL,
+        start_new_session=True, env={**os.environ, **ONE_THREAD},
     )  # fmt: skip
     theirs.close()
     return process, Connection(ours.detach())
