@@ -8,7 +8,6 @@ this process, with a stand-in for the reader of logs.
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import os
 import random
@@ -506,12 +505,14 @@ def test_code_of_a_run_folder_runs_only_where_the_user_says_so(
 
 @pytest.mark.parametrize(("said", "trusted"), [("y\n", True), ("yes\n", True), ("n\n", False), ("", False)])
 def test_at_a_terminal_the_user_is_asked(monkeypatch: pytest.MonkeyPatch, said: str, trusted: bool) -> None:
-    keys = io.StringIO(said)
-    monkeypatch.setattr(keys, "isatty", lambda: True)
-    monkeypatch.setattr("sys.stdin", keys)
+    other, end = os.openpty()
+    os.write(other, said.encode() or b"\x04")  # Ctrl-D: nothing more is typed
     args = argparse.Namespace(trust=False)
-    with nullcontext() if trusted else pytest.raises(InputError, match="^RUN: its code was not run$"):
-        cli_options.trusted(args, "RUN", ["RUN/machine/system.py"])
+    with os.fdopen(end) as keys:
+        monkeypatch.setattr("sys.stdin", keys)
+        with nullcontext() if trusted else pytest.raises(InputError, match="^RUN: its code was not run$"):
+            cli_options.trusted(args, "RUN", ["RUN/machine/system.py"])
+    os.close(other)
 
 
 def test_a_plan_of_a_campaign_brings_no_controller_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

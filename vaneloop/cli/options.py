@@ -165,7 +165,7 @@ def trusted(args: argparse.Namespace, source: str, code: Sequence[str]) -> None:
     if not code or args.trust:
         return
     text = terminal.clean(f"{source}: names code that would run here with your rights: {', '.join(code)}")
-    if not sys.stdin.isatty():
+    if not terminal.is_terminal(sys.stdin) or terminal.input_of(sys.stdin) is None:
         raise InputError(f"{text}; --trust says that it may")
     print(f"{text}\nRun it? [y/N] ", end="", file=sys.stderr, flush=True)
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
