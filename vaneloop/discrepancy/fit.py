@@ -24,7 +24,7 @@ from vaneloop.discrepancy.latest import Latest
 from vaneloop.discrepancy.stage import Array, Stage, StageError
 from vaneloop.discrepancy.whiten import whiten
 
-__all__ = ["Fit", "Judge", "Task", "finished", "recalibrate"]
+__all__ = ["Fit", "Judge", "Task", "covariance", "finished", "recalibrate"]
 
 Answer = TypeVar("Answer")
 Task = Generator[
@@ -411,7 +411,7 @@ class Judge:
             worth = min(1.0 / excess, EVIDENCE * len(self.stage.outputs) / max(self.n, 1))
             info = normals.sum(axis=0)[np.ix_(loose, loose)] * worth + np.diag(scaled_prior[loose])
             variance = np.zeros(k)
-            variance[loose] = np.diag(np.linalg.pinv(info))
+            variance[loose] = np.diag(covariance(info))
             half[move] = (1.645 * np.sqrt(np.maximum(variance, spread)) * scale)[move]
             turn = np.array([p.period or np.inf for p in self.stage.all_parameters()])[free]
             half = np.minimum(half, 0.5 * turn)
@@ -455,6 +455,16 @@ class Judge:
         step = np.linalg.solve(total - a + ridge, (pull - g)[:, :, None])[:, :, 0]
         step = np.clip(step, (low[columns] - theta[columns]) / size, (high[columns] - theta[columns]) / size)
         return np.asarray(cost - 2.0 * np.sum(step * g, axis=1) + np.einsum("bi,bij,bj->b", step, a, step))
+
+
+def covariance(information: Array) -> Array:
+    """Covariance of parameters from the normal matrix of their fit; infinite where that is no number, because the
+    model's slopes have no squares: nothing is known of such a parameter.
+    """
+    known = np.isfinite(information).all(axis=1)
+    out = np.diag(np.where(known, 0.0, np.inf))
+    out[np.ix_(known, known)] = np.linalg.pinv(information[np.ix_(known, known)])
+    return out
 
 
 def _apart(one: Moves, other: Moves) -> bool:

@@ -438,7 +438,7 @@ def _in_words(name: str, x: Array, y: Array, unit: str, x_unit: str) -> str:
         return f"is nearly constant at {y.mean():.3g} {unit}{sense}"
     best, score = "", -1.0
     for text, f in forms.items():
-        if np.ptp(f) == 0.0:
+        if not np.ptp(f) > 1e-12 * np.abs(f).max():  # a curve of one point
             continue
         c = np.polyfit(f, y, 1)
         r2 = 1.0 - float(np.sum((y - np.polyval(c, f)) ** 2)) / total

@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from vaneloop.base.sizes import LARGEST, beyond, no_smaller
 from vaneloop.discrepancy.models.motion import (
     MOTION,
     differentiated_to,
@@ -79,14 +80,18 @@ class Data:
                     f"{r.name}: no channel {c!r}, which system {s.name!r} needs{hint}; the log has "
                     f"{', '.join(list(r.columns)[:12])}"
                 )
-        t = np.asarray(r.t, dtype=float)
+        t = no_smaller(np.asarray(r.t, dtype=float))
         if t.ndim != 1 or len(t) < 50:
             raise StageError(f"{r.name}: {t.size} samples; at least 50 are needed")
         if not np.all(np.isfinite(t)) or np.any(np.diff(t) <= 0):
             raise StageError(f"{r.name}: time must rise from sample to sample")
+        if beyond(t).any():
+            raise StageError(f"{r.name}: time reaches {t[-1]:.3g} s; allowed: {LARGEST:g}")
         columns = {}
         for c, v in r.columns.items():
-            v = np.asarray(v, dtype=float)
+            v = no_smaller(np.asarray(v, dtype=float))
+            if (far := beyond(v) & np.isfinite(v)).any():
+                raise StageError(f"{r.name}: channel {c!r} reaches {v[far][0]:.3g}; allowed: {LARGEST:g}")
             if v.shape != t.shape:
                 raise StageError(f"{r.name}: channel {c!r} has shape {v.shape}; {t.shape} is needed, as the time has")
             if c in (*s.inputs, s.position, s.velocity):

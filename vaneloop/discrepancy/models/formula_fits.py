@@ -11,7 +11,7 @@ from vaneloop.base.curve import FINE, POINTS
 from vaneloop.base.forms import FORMS, Form
 from vaneloop.base.side_by_side import side_by_side
 from vaneloop.discrepancy.error_share import FORM, score
-from vaneloop.discrepancy.fit import Judge
+from vaneloop.discrepancy.fit import Judge, covariance
 from vaneloop.discrepancy.formulas import Formula, begin, text_of, values_of
 from vaneloop.discrepancy.locate import agrees
 from vaneloop.discrepancy.models.curve import runs
@@ -52,10 +52,10 @@ def _variance(tried: Tried, visited: Array) -> Array:
     c, judge, fit = tried.candidate, tried.judge, tried.fit
     scale, own = judge.scale[fit.free], judge.stage.index()[c.name]
     mine = np.flatnonzero((fit.free >= own.start) & (fit.free < own.stop))
-    covariance = np.linalg.pinv(fit.normals.sum(axis=0) + np.diag(fit.prior * scale**2))[np.ix_(mine, mine)]
-    covariance *= max(1.0, float(fit.cost.sum()) / max(judge.n, 1))
+    known = covariance(fit.normals.sum(axis=0) + np.diag(fit.prior * scale**2))[np.ix_(mine, mine)]
+    known *= max(1.0, float(fit.cost.sum()) / max(judge.n, 1))
     rows = np.array([tried.at(visited, step) for step in np.diag(scale[mine])])
-    return np.asarray(np.maximum(np.einsum("in,ij,jn->n", rows, covariance, rows), 0.0))
+    return np.asarray(np.maximum(np.einsum("in,ij,jn->n", rows, known, rows), 0.0))
 
 
 def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[tuple[Formula, Tried]]:
