@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -25,6 +26,7 @@ from plant import build_plant
 from plant.parameters import PLAY
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
+from vaneloop.discrepancy.locate import AGREES
 
 SHIPPED, flashed = build_plant(), cache(load_calibration)
 
@@ -63,7 +65,9 @@ def test_the_lag_doubles_until_the_noise_stops_growing(monkeypatch: pytest.Monke
     assert levels({1: 1.0, 2: 1.5, 4: 1.6}, monkeypatch) == pytest.approx(1.55)  # a plateau: less than 1.08-fold
     assert levels({1: 1.0, 2: 1.5, 4: 1.65, 8: 1.65}, monkeypatch) == pytest.approx(1.65)  # none at 1.1-fold
     assert levels({1: 1.0, 2: 2.0, 4: 4.3}, monkeypatch) == 2.0  # motion takes over: more than 2.1-fold
-    assert levels({1: 1.0, 2: 2.09, 4: 2.09}, monkeypatch) == 2.09
+    assert levels({1: 1.0, 2: 2.1, 4: 2.1}, monkeypatch) == 2.1
+    assert levels({1: 1.0, 2: 1.08, 4: 1.6, 8: 1.6}, monkeypatch) == 1.6  # 1.08-fold is none yet
+    assert levels({1: 1.0, 2: 1.08, 4: 1.08}, monkeypatch) == 1.08 and figures.AGREES == AGREES == 1.1
 
 
 def test_the_lag_stays_below_a_twelfth_of_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,6 +195,12 @@ def test_a_few_wrong_levels_leave_the_step_behind_another() -> None:
     assert resolution_before(y) == pytest.approx(3.4, rel=1e-2)
     y[:300] -= np.arange(300.0, 0.0, -1.0) * 0.3
     assert resolution_before(y) == 0.0
+
+
+def test_levels_off_by_more_than_half_a_small_step_have_no_step_behind_it() -> None:
+    """Gaps of 10, 11, 9 small steps: a third of the levels is two thirds of one off the mean."""
+    assert resolution_before(np.cumsum([0.0, *[10.0, 11.0, 9.0] * 60])) == 0.0
+    assert resolution_before(np.cumsum([0.0, *[10.0, 11.0] * 60])) == pytest.approx(10.5, rel=1e-3)
 
 
 # ---- figures ---------------------------------------------------------------------------------------------------------
@@ -323,6 +333,24 @@ def test_a_demand_of_a_tenth_of_a_second_drives_the_loop(end: float, good: bool,
             replay(log_of(end))
 
 
+def test_one_demand_alone_holds(loop: Loop) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = replay(Log("a.csv", {"n_dem": Channel(np.array([0.3]), np.array([60.0]))}))
+    assert (loop.stimulus.rows[:, 0] == 60.0).all() and len(loop.stimulus.rows) == 31 and found.notes == []
+
+
+@pytest.mark.parametrize("late, had", [(0.004, 62.0), (0.0055, 61.0), (-0.004, 61.0), (-0.0055, 62.0)])
+def test_a_frame_is_in_the_answer_that_is_within_half_a_period(late: float, had: float, loop: Loop) -> None:
+    """The answer of the tick at 1 s is off its time; one frame comes just before the earlier, one before the later."""
+    stamps = np.arange(201) * 0.01
+    stamps[100] += late
+    frames = np.array([0.0, 1.0 + min(late, 0.0) - 0.0002, 1.0 + max(late, 0.0) - 0.0001, 2.0])
+    n_dem = Channel(frames, np.array([60.0, 61.0, 62.0, 63.0]), framed=True)
+    replay(Log("a.csv", {"n_dem": n_dem, "x_lvdt": Channel(stamps, np.full(201, 20.0))}))
+    assert loop.stimulus.rows[100, 0] == had
+
+
 def test_the_firmware_gets_what_the_log_s_ecu_sent(loop: Loop) -> None:
     t = np.array([0.0, 0.5, 1.5])
     replay(log_of(2.0, n_r=Channel(t, np.array([61.0, 62.0, 63.0])), p_s=Channel(t, np.array([20.0, 21.0, 22.0]))))
@@ -420,13 +448,14 @@ def test_a_hole_in_the_demand_is_longer_than_half_a_second_and_five_samples(
 
 
 def test_a_current_is_its_mean_since_the_log_s_last_sample_and_the_rest_lies_in_between() -> None:
-    t, values = 3.0 + np.arange(8) * 0.5, np.array([0.0, 1.0, 0.0, 4.0, 2.0, 2.0, 6.0, 0.0])
+    t, values = 3.0 + np.arange(8) * 0.5, np.array([2.0, 1.0, 0.0, 4.0, 2.0, 2.0, 6.0, 0.0])
     when = np.array([4.0, 4.5, 5.5])  # of the steps that end there; a step before the first one is as long as the next
     assert replay_module._model_at("i_cmd", t, values, when) == pytest.approx([0.0, 4.0, 2.0])
-    assert replay_module._model_at("i_cmd", t, values, np.array([4.25, 5.25])) == pytest.approx([1.0, 2.75], abs=1.0)
-    assert replay_module._model_at("i_cmd", t, values, np.array([3.0, 3.5])) == pytest.approx([0.0, 1.0])
-    assert replay_module._model_at("x_lvdt", t, values, np.array([3.25, 4.75])) == pytest.approx([0.5, 3.0])
-    assert replay_module._model_at("i_cmd", t, values, np.array([3.25])) == pytest.approx([0.5])  # no time before it
+    across = replay_module._model_at("i_cmd", t, values, np.array([4.25, 5.25]))  # half of some steps
+    assert across == pytest.approx([0.5 * (0.5 * 1.0 + 0.0 + 0.5 * 4.0), 0.5 * (0.5 * 4.0 + 2.0 + 0.5 * 2.0)])
+    assert replay_module._model_at("i_cmd", t, values, np.array([3.0, 3.5])) == pytest.approx([2.0, 1.0])
+    assert replay_module._model_at("x_lvdt", t, values, np.array([3.25, 4.75])) == pytest.approx([1.5, 3.0])
+    assert replay_module._model_at("i_cmd", t, values, np.array([3.25])) == pytest.approx([1.5])  # no time before it
 
 
 def test_what_the_controller_sent_is_that_of_the_nearest_tick() -> None:
