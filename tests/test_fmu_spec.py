@@ -5,6 +5,7 @@ the memory, and a plant of others with its units.
 from __future__ import annotations
 
 import ctypes
+import gc
 import itertools
 import math
 import re
@@ -31,6 +32,7 @@ from hil.fmu.variables import FIXED, INPUT, OUTPUT, PARTS, REAL, TRUTH, TUNABLE,
 from hil.loop.node import Node
 from plant import Model, build_plant, places
 from plant.parameters import LVDT_STEP
+from vaneloop.base import extras
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import read
 
@@ -530,7 +532,7 @@ def test_the_models_source_is_its_variables_and_numbers() -> None:
         Variable("out", WHOLE, OUTPUT, "", "mode", at=0),
         Variable("more", REAL, TUNABLE, "-", "a number", -0.0, -math.inf, 1.0, -1, 8),
     ]
-    memory = np.array([0.0, 5.0, 6.0, math.nan, math.inf, -math.inf, 0.1, 7.0, 8.0])
+    memory = np.array([4.0, 5.0, 6.0, math.nan, math.inf, -math.inf, 0.1, 7.0, 8.0])
     head, body = source.model_source("loop", Shape(1, 2, 3), memory, variables)
     rows = re.findall(r"    \{(\w+), (\w+), (-?\d+), (-?\d+), (.*?), (\"(?:[^\"\\]|\\.)*\"), (\".*?\")\},", body)
     assert rows == [
@@ -917,7 +919,7 @@ def fmpy(said: Any, platforms: tuple[str, ...] = ("x86_64-linux", "c-code")) -> 
         fmi1=SimpleNamespace(FMICallException=Failure), fmi2=SimpleNamespace(FMU2Slave=OldSlave),
         fmi3=SimpleNamespace(FMU3Slave=Slave), platform="linux64", platform_tuple="x86_64-linux",
         read_model_description=lambda path, validate: said, supported_platforms=lambda path: list(platforms),
-        extract=lambda path, folder: None,
+        extract=lambda path, folder: (Path(folder) / "its path").write_text(path),
     )  # fmt: skip
 
 
@@ -949,6 +951,7 @@ def test_signals_go_in_and_out_in_the_plants_own_units(
     assert its.asked[1:] == ["instantiate", *entered, "exit"]
     given = its.asked[0]
     assert (given["guid"], given["modelIdentifier"], given["instanceName"]) == ("{g}", "it", "plant")
+    assert (Path(given["unzipDirectory"]) / "its path").read_text() == archive
     assert its.inputs == pytest.approx({1: 0.0, 2: 20.0, 3: 323.15})
     assert fmu.notes == [f"{archive}: vgv1 has no unit; taken as rad"]
     assert fmu.outputs() == pytest.approx({"x_lvdt": 24e-3, "n_engine": 60.0, "vigv": math.pi / 6, "vgv1": 0.25})
@@ -966,6 +969,15 @@ def test_signals_go_in_and_out_in_the_plants_own_units(
     its.get = its.getFloat64 = fmu._read = lambda references: [math.nan] * len(references)
     with pytest.raises(InputError, match=r"x_lvdt \(=nan\) at t = 0\.002 s must be finite"):
         fmu.outputs()
+
+
+def test_what_was_unpacked_goes_with_the_plant(archive: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    fmu = plant_of(monkeypatch, archive, described())
+    folder = Path(fmu._fmu.asked[0]["unzipDirectory"])
+    assert folder.is_dir()
+    del fmu
+    gc.collect()
+    assert not folder.exists()
 
 
 def test_names_are_joined_by_the_map(archive: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1038,6 +1050,12 @@ def test_an_fmu_that_does_not_start_says_why_in_one_line(archive: str, monkeypat
     with pytest.raises(InputError, match=r"cannot be started \(a b c{196}\)$"):
         plant_of(monkeypatch, archive, described())
     assert plant_fmu._line(Failure("")) == "Failure"
+
+
+def test_without_fmpy_the_extra_is_named(archive: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extras, "is_there", lambda module: False)
+    with pytest.raises(InputError, match=r"theirs\.fmu: an FMU needs fmpy, .* pip install 'vaneloop\[fmu\]'"):
+        PlantFmu(archive, VANES)
 
 
 def test_the_node_reads_its_sensors_from_the_fmu() -> None:

@@ -169,5 +169,7 @@ def test_bad_input_is_refused_in_one_line(wrong: Any, said: str) -> None:
 
 def test_names_are_imported_when_they_are_used() -> None:
     assert set(vaneloop.__all__) <= set(dir(vaneloop))
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+    for name in vaneloop.__all__:
+        assert getattr(vaneloop, name).__name__ == name
+    with pytest.raises(AttributeError, match="module 'vaneloop' has no attribute 'nothing'"):
         _ = vaneloop.nothing
