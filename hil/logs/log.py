@@ -24,7 +24,6 @@ from hil.logs.source import ABSENT, Channel, LogError, Options, Series, Source, 
 from hil.logs.table import NoTime
 from hil.logs.units import Units
 from vaneloop.base.signals import UNITS
-from vaneloop.base.sizes import LARGEST, SMALLEST, beyond, no_smaller
 
 __all__ = ["FORMATS", "Channel", "Format", "Log", "LogError", "offered", "read_log", "write_log"]
 
@@ -49,13 +48,6 @@ class Log:
     def __post_init__(self) -> None:
         wrong = []
         for name, c in self.channels.items():
-            if (far := beyond(c.values)).any():
-                raise LogError(f"{self.path}: {name}: reaches {c.values[np.argmax(far)]:.3g}; allowed: {LARGEST:g}")
-            if (values := no_smaller(c.values)) is not c.values:
-                self.channels[name] = replace(c, values=values)
-                few = np.count_nonzero(values != c.values)
-                what = f"{few:,} of {values.size:,} samples are smaller than {SMALLEST:g}: taken as 0"
-                self.notes.append(f"{name}: {what}")
             if is_ours(name, self.signals) and (why := plausible.judge(name, c.values)[1]):
                 wrong.append((name, name, why, c.values))
         _refuse_units(self.path, wrong)
@@ -132,7 +124,7 @@ def _in_time(s: Series, t: np.ndarray, known: dict[int, np.ndarray], notes: list
 def _clean(path: Path, signal: str, key: str, s: Series, in_order: bool, notes: list[str]) -> Channel | None:
     """Samples that can be used: both numbers finite, time strictly increasing; None where nothing is left."""
     t, values = s.t, s.values
-    finite = np.isfinite(t) & np.isfinite(values) & ~beyond(values)
+    finite = np.isfinite(t) & np.isfinite(values)
     if not finite.all():
         lost = int(np.count_nonzero(~finite & ~(is_absent(values) | is_absent(t))))
         if lost:

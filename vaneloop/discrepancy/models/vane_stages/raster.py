@@ -13,6 +13,7 @@ import numpy as np
 from hil.logs import Channel, Log, LogError
 from hil.logs.held import COMMANDS, answers, held, taken
 from vaneloop.base.compiled import compiled
+from vaneloop.base.sizes import no_smaller
 from vaneloop.discrepancy.stage import Array, Stage
 
 __all__ = [
@@ -147,7 +148,7 @@ def _columns(channels: Mapping[str, Channel], grid: Grid, t: Array) -> tuple[dic
         away = np.minimum(np.abs(c.t[i] - when), np.abs(when - c.t[i - 1]))
         fresh &= away < 1.5 * max(step, dt)  # one or two rows are bridged, more are a gap
         missing |= away > 0.75 * max(step, dt)
-    return columns, fresh, missing
+    return {name: no_smaller(v) for name, v in columns.items()}, fresh, missing
 
 
 def _held(c: Channel, step: float, dt: float) -> bool:
