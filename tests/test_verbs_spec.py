@@ -110,7 +110,9 @@ def fit(k: float, size: float) -> Any:
 
 def test_fits_are_held_against_the_part_that_they_have_not_seen() -> None:
     measured = np.array([np.where(np.arange(11) < 3, np.nan, 10.0), np.full(11, 12.0)])
-    chain: Any = SimpleNamespace(stages=[stage("a", ("y", "z")), stage("b")], test=None)
+    other = stage("b")
+    other = replace(other, effects=(replace(other.effects[0], name="other"),))
+    chain: Any = SimpleNamespace(stages=[other, stage("a", ("y", "z"))], test=None)
     fits = [("a", fit(7.0, 0.0), fit(7.0, 2.0)), ("b", fit(1.0, 0.0), fit(1.0, 0.0))]
     assert parts.tested(chain, fits) == [] and parts.tested(SimpleNamespace(stages=[]), fits) == []
     chain.test = SimpleNamespace(stages=[stage("a", ("y", "z"), measured=measured)], whole=None)
@@ -268,11 +270,14 @@ def test_pieces_are_added_until_every_visited_bin_is_in() -> None:
     whole = whole_of(6, at_levels(levels))
     assert long._everywhere(whole, [0]) == [0, 2, 4]
     assert long._everywhere(whole, [0, 5]) == [0, 2, 5] and long._everywhere(whole, [0, 2, 4]) == [0, 2, 4]
+    for looks, expected in ((29, [0]), (30, [0, 1])):  # 3 s make a bin visited
+        channels = at_levels([0.0] * 4)
+        channels["n_r"].values[610 : 610 + looks] = 8.0
+        assert long._everywhere(whole_of(4, channels), [0]) == expected
     channels = at_levels([0.0] * 4)
-    channels["n_r"].values[610:635] = 8.0  # 2.5 s: too short to count as visited
-    assert long._everywhere(whole_of(4, channels), [0]) == [0]
-    channels["n_r"].values[610:645] = 8.0
-    assert long._everywhere(whole_of(4, channels), [0]) == [0, 1]
+    channels["n_r"].values[900:929] = channels["n_r"].values[1500:1501] = 8.0  # 29 looks, and one in the next piece
+    assert long._everywhere(whole_of(4, channels), [0]) == [0, 1, 2]
+    assert long._everywhere(whole_of(4, channels), [0, 2]) == [0, 1, 2]
 
 
 def test_an_excerpt_has_half_its_pieces_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -307,7 +312,12 @@ def test_a_log_is_held_stretch_by_stretch_and_what_fails_told_by_its_time(monkey
         hot = {0: [2, 3, 7], 2: [1]}.get(k, [])
         return [sums("a", hot, here, k * long.STRETCH * BLOCKS), sums("b", [], here, k * long.STRETCH * BLOCKS)]
 
+    looked: list[tuple[float, int]] = []
+    judged = long.failing
     monkeypatch.setattr(long, "_stretch", stretch)
+    monkeypatch.setattr(
+        long, "failing", lambda s, level, looks: looked.append((level, looks)) or judged(s, level, looks)
+    )
     held_chain: Any = SimpleNamespace(whole=whole_of(pieces + 0.5, chosen=(0, 1, 5)))
     told: list[float] = []
     fits = [(n, [np.array([1.0]), np.array([2.0])], np.array([0.5]), 1.0) for n in ("a", "b")]
@@ -320,7 +330,7 @@ def test_a_log_is_held_stretch_by_stretch_and_what_fails_told_by_its_time(monkey
     assert held.failing[0].error == pytest.approx(0.5 * held.failing[0].ratio)
     assert held.pieces == (7, 3, 2, 2 * long.STRETCH + 1)  # the worst first
     assert held.fitted == [(50.0, 170.0), (350.0, 410.0)] and set(held.sums) == {"a", "b"}
-    assert held.of("a") == held.failing and held.of("b") == []
+    assert held.of("a") == held.failing and held.of("b") == [] and looked == [(1.0, 2 * (pieces + 1))] * 2
     assert held.json()["fitted_s"] == held.fitted and held.json()["failing"][0]["low"] == 170.0
 
 
@@ -729,7 +739,8 @@ def test_an_experiment_is_recommended_where_rivals_are_left() -> None:
     e = {"score": 3.5, "profile": "p", "repeats": 2, "separates": ["x"], "text": "Run p.", "table": [1], "more": 0}
     said = search.Experiment(diagnosed, e, "a.csv").to_dict()
     assert said["recommended"] == {"nats": 3.5, "profile": "p", "repeats": 2, "separates": ["x"], "text": "Run p."}
-    assert said["profiles"] == [1] and search.Experiment(diagnosed, e).sentence() == "Run p."
+    assert said["profiles"] == [1] and (said["schema"], said["log"], said["notes"]) == (1, "a.csv", ["n"])
+    assert search.Experiment(diagnosed, e).sentence() == "Run p."
 
 
 def located(fails: bool) -> Any:
@@ -758,3 +769,135 @@ def test_a_model_fails_where_a_stage_or_a_time_of_a_long_log_does(stages: Any, h
     assert ("whole" in out) == (held is not None) and said.verb == "compare"
     plain = search.Stages(bound, [located(False)], "a.csv").to_dict()
     assert not {"signals", "verdict", "whole"} & plain.keys() and plain["notes"] == ["n"]
+
+
+def test_a_page_is_headed_by_what_was_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vaneloop.pages.diagnosis.compare_page", lambda *a: a)
+    bound: Any = SimpleNamespace(test=None)
+    compared = search.Stages(bound, [], "a.csv")
+    one, two = (replace(compared, verb=verb).page("words") for verb in ("compare", "locate"))
+    assert one == ([], bound, "words", "a.csv", None, [], "Model and log") and two[-1] == "Where the model fails"
+
+
+def test_an_extended_model_is_written(tmp_path: Path) -> None:
+    diagnosis: Any = SimpleNamespace(stages=[])
+    bound: Any = SimpleNamespace(test=None)
+    made = search.Extended(bound, diagnosis, model=Model(effects={"lvdt_bias": {"bias": 0.1}}))
+    assert made.write(tmp_path / "m.toml") == tmp_path / "m.toml" and made.refused == made.path == ""
+    assert "bias = 0.1" in (tmp_path / "m.toml").read_text()
+    laws = answer("learned", [law()], model=Model(curves={"bend": CURVE}))
+    assert (
+        laws.write(tmp_path / "l.toml") == tmp_path / "l.toml" and "[curves.bend]" in (tmp_path / "l.toml").read_text()
+    )
+    noted = learn.with_path(laws, str(tmp_path / "n.toml"), "learn a.csv")
+    assert noted.path == str(tmp_path / "n.toml") and noted.model is not None
+    assert noted.model.meta == {"history": ["learn a.csv"]} and "learn a.csv" in (tmp_path / "n.toml").read_text()
+
+
+def test_a_controller_of_the_user_s_own_has_the_scalars_beside_the_tables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.native.Program", lambda path, own: (path, own))
+    assert Machine().calibration.program is None
+    assert Machine(controller="c.so").calibration.program == ("c.so", None)
+    (tmp_path / "calibration.toml").write_text(Path("tables/calibration.toml").read_text())
+    assert Machine(tmp_path, controller="c.so").calibration.program == ("c.so", None)
+    (tmp_path / "own_calibration.toml").write_text("")
+    own = str(tmp_path / "own_calibration.toml")
+    assert Machine(tmp_path, controller="c.so").calibration.program == ("c.so", own)
+    assert Machine(tmp_path).calibration.program is None
+
+
+def test_a_diagnosis_notes_what_the_log_said_what_fails_and_what_is_at_its_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[Any] = []
+    row = {"parameter": "k", "value": 1.0, "unit": "mm", "at_limit": True}
+    found = SimpleNamespace(stages=[SimpleNamespace(stage="a", recalibrated=[row])], notes=["old"])
+    monkeypatch.setattr(search, "search", lambda *a, **how: asked.append((a, how)) or found)
+    limit = "a: k stands at the end of its tolerance, 1 mm: the log would have it go on"
+    chain: Any = SimpleNamespace(whole=None, stages=["s"], not_observed={"b": "x"}, notes=["n"])
+    tell: Any = object()
+    said = search.diagnosed(chain, "a.csv", 3, tell, tell)
+    assert asked == [((["s"], {"b": "x"}, tell, 3), {"news": tell})] and said.held is None and said.bound is chain
+    assert said.diagnosis.notes == ["n", limit] and said.log == "a.csv"
+    chain.whole = "whole"
+    monkeypatch.setattr(search, "searched", lambda *a: asked.append(a) or (chain, found, HELD))
+    said = search.diagnosed(chain, "a.csv", 3, tell, tell)
+    assert asked[-1] == (chain, 3, tell, tell) and said.held is HELD
+    assert said.diagnosis.notes == ["n", str(HELD.failing[0]), limit]
+
+
+def test_stages_of_a_log_that_is_there_whole_are_located_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(long, "locate_stages", lambda stages, progress: [stages, progress])
+    chain: Any = SimpleNamespace(whole=None, stages=["s"])
+    tell: Any = object()
+    assert long.located(chain, tell) == ([["s"], tell], None)
+
+
+def test_stages_of_a_long_log_have_the_errors_of_all_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclass
+    class Figures:
+        signal: str
+        rms: float = -1.0
+        rms_as_given: float = -1.0
+        samples: int = -1
+
+    @dataclass
+    class At:
+        stage: str
+        signals: tuple[Figures, ...]
+        fit: Any = None
+        floor: Any = None
+
+    found = [
+        At("a", (Figures("z"), Figures("y")), fit(7.0, 0.0), np.array([0.5, 0.5])),
+        At("b", (Figures("y"),), fit(1.0, 0.0)),
+    ]
+    found[1].floor = np.array([0.5])
+    asked: list[Any] = []
+    held = SimpleNamespace(sums={"a": sums("a", [0], 2, outputs=("y", "z"))})
+    monkeypatch.setattr(long, "locate_stages", lambda stages, progress: list(found))
+    monkeypatch.setattr(long, "held_against", lambda *a: asked.append(a) or held)
+    monkeypatch.setattr(long, "rms_of", lambda judge, f: 3.0)
+    chain: Any = SimpleNamespace(
+        whole="whole", stages=[], stage=lambda name: stage(name, ("y", "z") if name == "a" else ("y",))
+    )
+    out, same = long.located(chain, None, 5)
+    assert same is held and out[1] is found[1] and asked[0][0] is chain and asked[0][2] == 5
+    (name, (given, fitted), floor, left), _ = asked[0][1]
+    assert (name, given.tolist(), fitted.tolist(), left) == ("a", [1.0, 0.0, 0.0], [7.0, 5.0, 0.0], 9.0)
+    assert floor.tolist() == [0.5, 0.5]
+    z, y = out[0].signals
+    assert (z.signal, z.rms, z.rms_as_given, z.samples) == ("z", 0.5, 0.5, 1200)
+    assert y.rms == pytest.approx(0.5 * math.sqrt((9.0 + 1.0) / 2.0)) and y.rms_as_given == 0.5
+
+
+def test_verbs_tell_a_system_from_a_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(search, "chain_for", lambda *a: asked.append(("chain", *a)) or ("chain", "a.csv"))
+    monkeypatch.setattr(search, "not_given", lambda chain, without: (chain, *without))
+    monkeypatch.setattr(search, "diagnosed", lambda *a: ("diagnosed", *a))
+    monkeypatch.setattr(search, "compared", lambda *a, progress: ("compared", *a, progress))
+    monkeypatch.setattr("vaneloop.discrepancy.models.experiment.recommend", lambda d, progress, bound: {"text": "go"})
+    machine, tell = Machine(), object()
+    said: Any = search.diagnose("a.csv", machine, fit="0:1", without=["x"], progress=tell)  # type: ignore[arg-type]
+    assert said == ("diagnosed", ("chain", "x"), "a.csv", 2, tell) and asked == [("chain", "a.csv", machine, "0:1", ())]
+    said = search.compare("a.csv", progress=tell)  # type: ignore[arg-type]
+    assert said == ("compared", "chain", "a.csv", tell) and asked[-1][2] == Machine()
+    monkeypatch.setattr(search, "diagnosed", lambda *a: search.Diagnosed("bound", SimpleNamespace(), "a.csv"))  # type: ignore[arg-type]
+    assert search.experiment("a.csv", machine).sentence() == "go" and asked[-1][2] is machine
+    assert search.experiment("a.csv").log == "a.csv" and asked[-1][2] == Machine()
+    bound = SimpleNamespace(fitted=SimpleNamespace(stages=["s"]), judged=lambda: "judged")
+    monkeypatch.setattr(search, "_logs", lambda *a: asked.append(("logs", *a)) or (bound, "r.csv"))
+    found = SimpleNamespace(stages=["first", "second"], notes=["old"])
+    monkeypatch.setattr(search, "search", lambda *a: asked.append(("search", *a)) or found)
+    by_log = SimpleNamespace(notes=["by log"])
+    monkeypatch.setattr("vaneloop.discrepancy.models.by_log.ByLog.of", lambda *a: asked.append(("of", *a)) or by_log)
+    own = system(without=["a"])
+    said = search.diagnose("r.csv", own, without=["b"], progress=tell)  # type: ignore[arg-type]
+    (_, log, of, *_), (_, *how), (_, *by) = asked[-3:]
+    assert log == "r.csv" and tuple(of.without) == ("a", "b") and how == [["s"], None, tell, 1, "judged"]
+    assert by == [bound, "first", None] and said.diagnosis.notes == ["by log"] and said.by_log is by_log
+    monkeypatch.setattr(search, "_extended", lambda *a: ("extended", *a))
+    assert search.extend("r.csv", ["law"], own) == ("extended", bound, "r.csv", ["law"], None)
