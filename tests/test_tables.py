@@ -9,6 +9,7 @@ import copy
 import json
 import tomllib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from plant.geometry import Geometry, Schedules, load_geometry, load_schedules
 from plant.parameters import ElectromechanicalTable, PlantTable, load_plant
 from tests.conftest import examples
 from vaneloop.base.errors import InputError
-from vaneloop.base.tables import Bound, Quantity, path, read
+from vaneloop.base.tables import Bound, Quantity, load_toml, path, read
 from vaneloop.design.schedule_files import write_stroke_tables, write_vane_angles
 from vaneloop.design.stroke_tables import stroke_tables, vane_angle_table
 
@@ -521,3 +522,13 @@ def test_strokes_stay_off_the_calibrated_limits_and_on_the_machine():
         and calibration.schedule.stroke_max.value < machine.table.actuator.stroke.value
     )
     assert calibration.servo.current_limit.value == machine.table.valve.rated_current.value
+
+
+@pytest.mark.parametrize("text", ["a = {w}", "a = 0.{w}", "{w} = 1", "b.{w} = 1", "[{w}]", "a = [1, {w}]"])
+def test_a_word_that_is_too_long_is_refused_with_its_line(text: str, tmp_path: Path) -> None:
+    file = tmp_path / "a.toml"
+    file.write_text("x = 1\n" + text.format(w="1" * 1_000) + "\n")
+    assert load_toml(file)["x"] == 1
+    file.write_text("x = 1\n" + text.format(w="1" * 1_001) + "\n")
+    with pytest.raises(InputError, match=r"a.toml: line 2: 1{30}\.\.\. is too long a word; allowed: 1,000 letters"):
+        load_toml(file)

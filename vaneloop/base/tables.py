@@ -20,14 +20,16 @@ MOST_BYTES = (
     1 << 20
 )  # of a TOML file; the largest shipped has 6 kB. The parser takes up to 600 bytes for each of dotted keys
 MOST_PARTS = 16  # of a dotted key: the parser's memory grows with their square, 6.8 GB for 50,000
+MOST_LETTERS = 1_000  # of a word or number; the parser slows down on longer ones
 _PART = rb"""(?:[A-Za-z0-9_-]++|"(?!"")(?:[^"\\\n]|\\[^\n])*+"|'(?!'')[^'\n]*+')"""
-# The words of a TOML file, each read once from the left: keys that are too long, other keys and texts, and a quotation
-# that nobody ends, where the parser stops, too.
+# The words of a TOML file, each read once from the left: keys, words and numbers that are too long, other keys and
+# texts, and a quotation that nobody ends, where the parser stops, too.
 _WORDS = re.compile(
-    rb"(?P<long>%(part)s(?:[ \t]*+\.[ \t]*+%(part)s){%(most)d})|%(part)s"
+    rb"(?P<word>[A-Za-z0-9_-]{%(letters)d})|(?P<long>%(part)s(?:[ \t]*+\.[ \t]*+%(part)s){%(most)d})|%(part)s"
     rb'|"""(?:[^"\\]|\\.|"(?!""))*+"""(?:"{0,2}+)'
     rb"|\'\'\'(?:[^\']|\'(?!\'\'))*+\'\'\'(?:\'{0,2}+)"
-    rb"|(?P<open>[\"'])|\#[^\n]*+|[^A-Za-z0-9_\"'\#-]++" % {b"part": _PART, b"most": MOST_PARTS},
+    rb"|(?P<open>[\"'])|\#[^\n]*+|[^A-Za-z0-9_\"'\#-]++"
+    % {b"part": _PART, b"most": MOST_PARTS, b"letters": MOST_LETTERS + 1},
     re.DOTALL,
 )
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]  # strict: neither "1.0" nor true is a number
@@ -113,8 +115,10 @@ def load_toml(file: str | Path) -> dict[str, Any]:
         if len(raw) > MOST_BYTES:
             raise _refusal(file, f"is longer than a TOML table may be ({MOST_BYTES:,} bytes)")
         stop = next((m for m in _WORDS.finditer(raw) if m.lastgroup), None)
-        if stop is not None and stop.lastgroup == "long":
+        if stop is not None and stop.lastgroup != "open":
             start, line = stop[0][:30].decode("utf-8", "replace"), raw.count(b"\n", 0, stop.start()) + 1
+            if stop.lastgroup == "word":
+                raise _refusal(file, f"line {line}: {start}... is too long a word; allowed: {MOST_LETTERS:,} letters")
             raise _refusal(file, f"line {line}: key {start}... has too many dotted parts; allowed: {MOST_PARTS}")
         return tomllib.loads(raw.decode("utf-8-sig").replace("\r\n", "\n"))
     except OSError as e:
