@@ -291,7 +291,10 @@ class _Page:
             with ui.element("div").classes("effects").style("max-height:330px"):
                 boxes = []
                 for name in library():
-                    title = load_scenario(name).title
+                    scenario = load_scenario(name)
+                    if scenario.secoc:  # the live loop's frames are not authenticated
+                        continue
+                    title = scenario.title
                     with ui.element("div").style("padding:3px 0;border-bottom:1px solid var(--grid)") as box:
                         ui.button(name, on_click=lambda name=name: self._begin(name)).props(
                             "flat dense no-caps align=left padding='1px 6px'"
