@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -182,18 +183,20 @@ def test_a_loop_gives_numbers_at_any_ends_of_all_parameters_and_effects_at_once(
         assert all(np.isfinite(v).all() for v in run.columns.values())
 
 
-def test_a_run_that_is_no_number_is_refused_where_it_arises() -> None:
-    machine, stimulus = build_plant(), Stimulus.of(np.full(20, 70.0))
+RUNS = [
+    lambda stimulus, plant: lockstep(stimulus, plant=plant),
+    lambda stimulus, plant: replay(log(), plant=plant),
+    pytest.param(lambda stimulus, plant: lockstep_lanes(stimulus, [plant]), marks=pytest.mark.slow),  # compiles
+]
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_a_run_that_is_no_number_is_refused_where_it_arises(run: Any) -> None:
+    machine = build_plant()
     p = machine.p.copy()
     p[LVDT_FACTOR] = np.nan
-    plant = replace(machine, p=p)
-    for run in (
-        lambda: lockstep(stimulus, plant=plant),
-        lambda: lockstep_lanes(stimulus, [plant]),
-        lambda: replay(log(), plant=plant),
-    ):
-        with pytest.raises(InputError, match=r"^simulation: x_lvdt \(=nan\) at t = 0.000 s must be finite"):
-            run()
+    with pytest.raises(InputError, match=r"^simulation: x_lvdt \(=nan\) at t = 0.000 s must be finite"):
+        run(Stimulus.of(np.full(20, 70.0)), replace(machine, p=p))
 
 
 def test_a_model_whose_curve_overflows_is_refused() -> None:
