@@ -8,23 +8,39 @@ import argparse
 import gc
 import json
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 from numba import njit, types
 from numba.core import compiler, config
+from pydantic import BaseModel, Field, ValidationError
 from scipy.interpolate import CubicSpline
 
-from vaneloop.base import compiled, curve, durations, extras, forms, hysteresis, kept, lean, spans, terminal, vanes
+from vaneloop.base import (
+    compiled,
+    curve,
+    durations,
+    extras,
+    files,
+    forms,
+    hysteresis,
+    kept,
+    lean,
+    spans,
+    terminal,
+    vanes,
+)
 from vaneloop.base.errors import InputError, meant
 from vaneloop.base.hull import hull_of, nearest_within, within
 from vaneloop.base.side_by_side import shared_out, side_by_side
 from vaneloop.base.spans import Span
 from vaneloop.base.spline_rates import SplineRates
+from vaneloop.base.tables import Quantity, _complaint
 
 # ---- names -----------------------------------------------------------------------------------------------------------
 
@@ -88,6 +104,52 @@ def test_what_is_not_installed_is_named_with_its_extra(monkeypatch: pytest.Monke
     extras.needs("a thing", "json", "nicegui")
     with pytest.raises(InputError, match=r"a thing needs can-isotp, which .*: pip install 'vaneloop\[diagnostics\]'"):
         extras.needed("a thing", "isotp")
+
+
+def test_a_quantity_that_says_no_tolerance_is_exact() -> None:
+    assert Quantity(value=1.0, unit="mm", origin="chosen: a test").tolerance == 0.0
+    with pytest.raises(ValueError, match="greater than or equal to 0"):
+        Quantity(value=1.0, unit="mm", origin="chosen: a test", tolerance=-1e-9)
+
+
+def test_a_table_of_no_known_kind_says_which_there_are() -> None:
+    class One(BaseModel):
+        kind: Literal["one"]
+
+    class Two(BaseModel):
+        kind: Literal["two"]
+
+    class Table(BaseModel):
+        part: One | Two = Field(discriminator="kind")
+
+    for given, says in (
+        ({"part": {}}, "part: key 'kind' is missing"),
+        ({"part": {"kind": "three"}}, "part.kind (='three'): must be one of 'one', 'two'"),
+    ):  # fmt: skip
+        with pytest.raises(ValidationError) as wrong:
+            Table.model_validate(given)
+        assert _complaint(wrong.value, Table) == says
+
+
+def test_what_is_written_is_brought_to_the_disk_with_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[Path] = []
+    there = os.readlink
+    monkeypatch.setattr(files.os, "fsync", lambda fd: synced.append(Path(there(f"/proc/self/fd/{fd}"))))
+    monkeypatch.chdir("/")
+    target = files.write(tmp_path / "a.txt", "text")
+    assert target.read_text() == "text" and [p.parent for p in synced[:-1]] == [tmp_path] * (len(synced) - 1)
+    assert synced[-1] == tmp_path and len(synced) > 1  # the file before it takes its name, the folder after
+    monkeypatch.chdir(tmp_path)
+    files.write("b.txt", b"bytes")
+    assert synced[-1] == tmp_path and (tmp_path / "b.txt").read_bytes() == b"bytes"
+
+
+def test_a_page_is_offered_where_there_is_one() -> None:
+    for report, options in ((None, ["json", "quiet"]), (False, ["json", "quiet"]), (True, ["report", "json", "quiet"])):
+        parser = argparse.ArgumentParser()
+        terminal.add_output_options(parser, *([] if report is None else [report]))
+        assert list(vars(parser.parse_args([]))) == options
+    assert parser.parse_args(["--quiet"]).quiet is True and parser.parse_args([]).json is None
 
 
 # ---- parts of logs ---------------------------------------------------------------------------------------------------
@@ -475,16 +537,17 @@ def test_compiled_code_is_kept_where_that_can_be_written(tmp_path: Path, monkeyp
 
 
 def test_code_is_kept_found_and_forgotten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    cache = tmp_path / "not" / "there"
+    monkeypatch.setattr(config, "CACHE_DIR", str(cache))
     monkeypatch.setattr(kept, "AHEAD", tmp_path / "ahead")
 
     def twice(x: float) -> float:
         return 2.0 * x
 
     one = kept.keep(njit(twice), lambda: "a stamp", "own")
-    files = one._cache
-    assert files.cache_path == str(tmp_path / "own") and not kept.is_kept(one) and one(1.5) == 3.0 and kept.is_kept(one)
-    (made,) = (tmp_path / "own").iterdir()  # nothing half written is left
+    own = one._cache
+    assert own.cache_path == str(cache / "own") and not kept.is_kept(one) and one(1.5) == 3.0 and kept.is_kept(one)
+    (made,) = (cache / "own").iterdir()  # nothing half written is left
     assert made.suffix == kept.ENTERED and made.name.startswith("test_base_spec.twice-")
     again = kept.keep(njit(twice), lambda: "a stamp", "own")
     assert again._cache.load_overload((types.float64,), again.targetctx) is not None

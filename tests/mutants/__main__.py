@@ -95,8 +95,8 @@ NEAREST = {
     "hil.inject": "inject fuzz campaign loop moments inject_spec fuzz_spec",
     "vaneloop": "verbs",
     "vaneloop.base": (
-        "base_spec lean tables kept parts held machines discrepancy learn_surfaces learn_turns learn_stops exit_codes "
-        "your_own_model verbs help curve_lanes"
+        "base_spec files streams lean tables kept parts held machines discrepancy learn_surfaces learn_turns "
+        "learn_stops exit_codes your_own_model verbs help curve_lanes"
     ),
     "vaneloop.discrepancy": (
         "discrepancy trust latest laws names search_limits search_ahead promise directions rivals curves "
