@@ -11,20 +11,51 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from plant import Model, build_plant, chain_lanes, curve, lanes, linkage, load_geometry, load_model, write_model
+from plant import (
+    Model,
+    build_plant,
+    chain_lanes,
+    curve,
+    effects_page,
+    lanes,
+    linkage,
+    load_geometry,
+    load_model,
+    write_model,
+)
 from plant import model as model_module
-from plant import parameters as nominal_parameters
 from plant.curve import PLACES, QUANTITIES, at_curve, quantity_of
 from plant.curve_lanes import alike
 from plant.effect import HYDRAULIC, KINDS, MOTOR, SITES, STAGES, T_REF, UNITS, Effect, Parameter, per_vane_stage
 from plant.effects import CURVES, EFFECTS, ROW
-from plant.effects_page import page
 from plant.geometry import Schedules, length_tolerances, load_schedules, stroke_for_vigv, vane_angles
-from plant.layout import C_HIGH, C_LAG, C_LOW, C_OF, C_PERIOD, C_SITE, C_STOPS, C_TABLE, CURVE_ROWS, PLAY, SIGNALS
+from plant.layout import (
+    C_HIGH,
+    C_LAG,
+    C_LOW,
+    C_OF,
+    C_PERIOD,
+    C_SITE,
+    C_STOPS,
+    C_TABLE,
+    CURVE_ROWS,
+    LVDT_STEP,
+    PLAY,
+    SIGNALS,
+    VANE_COUNT,
+)
 from plant.model import Learned, Second, allowed_of
 from plant.parameters import KIND, POT_BIAS, names_of, read_plant
 from plant.places import DRIVEN, LINKAGE_BACKLASH, POT, POT_BIAS_ERROR, POT_GAIN, RING
-from plant.spatial import Clearances, clearance_for, clearance_width, freedoms, spatial_angles
+from plant.spatial import (
+    Clearances,
+    clearance_for,
+    clearance_loop,
+    clearance_width,
+    contributions,
+    freedoms,
+    spatial_angles,
+)
 from vaneloop.base.curve import FINE_SIDE, POINTS, SIDE
 from vaneloop.base.errors import InputError
 from vaneloop.base.hysteresis import RADII, weights_of
@@ -92,12 +123,13 @@ def test_the_same_of_every_stage_has_its_name() -> None:
 
 
 def test_the_page_has_a_row_and_a_section_for_each_effect() -> None:
-    text = page()
+    text = effects_page.page()
     for e in EFFECTS.values():
         kind = "any" if e.kinds == KINDS else e.kinds[0]
         row = f"| [`{e.name}`](#{e.name}) | {e.site} | {kind} | {', '.join(e.stages)} | {e.summary} |\n"
         assert text.count(row) == 1 and text.count(f"\n## {e.name}\n") == 1
     assert "\n| `vigv`, `vgv1`, ... | deg |" in text and "`vgv2`" not in text
+    assert effects_page._sentence(" what  is\n told ") == "What is told"
     assert max(len(line) for line in text.splitlines() if not line.startswith("|")) <= 120
 
 
@@ -110,7 +142,7 @@ def test_signals_of_curves_are_in_si() -> None:
           "distance_since_reversal_of_x_lvdt": "distance", "time_since_reversal_of_x_lvdt": "since"}  # fmt: skip
     for name, q in QUANTITIES.items():
         assert SIGNALS[q.of] == of.get(name, name) and q.si == pytest.approx(si.get(q.unit, 1.0)) and q.name == name
-        assert (q.period, q.lag, q.stops) == (0.0, 0.0, False)
+        assert (q.period, q.lag, q.stops) == (0.0, 0.0, False) and quantity_of(name) is q
     assert len(QUANTITIES) == 12 + len(VANES)
 
 
@@ -403,14 +435,21 @@ def test_a_model_fills_rows_in_si_and_leaves_its_base() -> None:
 
 
 def test_noise_and_usual_values_are_those_of_the_tables() -> None:
-    for machine in (SHIPPED, ELECTRIC):
+    shipped, electric = build_plant(), build_plant("plant_electromechanical.toml")
+    for machine in (shipped, electric):
         sensors = machine.table.sensors
         pot = math.radians(sensors.pot_noise.value)
         assert machine.sigma == pytest.approx([1e-3 * sensors.lvdt_noise.value, *[pot] * 3, sensors.speed_noise.value])
         assert machine.usual["t_oil"] == machine.table.supply.temperature.value and machine.vanes == OWN
-    assert SHIPPED.usual["p_s"] == value_of("supply.pressure") and ELECTRIC.usual["p_s"] == 0.0
-    assert SHIPPED.kind == "hydraulic" and ELECTRIC.kind == "electromechanical" and ELECTRIC.p[KIND, 0] == 1.0
-    assert not SHIPPED.rows.flags.writeable and set(SHIPPED.rows) != set(ELECTRIC.rows)
+    assert shipped.usual["p_s"] == value_of("supply.pressure") and electric.usual["p_s"] == 0.0
+    assert shipped.kind == "hydraulic" and electric.kind == "electromechanical"
+    assert shipped.p[KIND, 0] == 0.0 and electric.p[KIND, 0] == 1.0 and (shipped.p[VANE_COUNT] == 3.0).all()
+    assert not shipped.rows.flags.writeable and set(shipped.rows) != set(electric.rows)
+    step = 1e-3 * shipped.table.sensors.lvdt_range.value / 2 ** int(shipped.table.sensors.lvdt_bits.value)
+    assert shipped.p[LVDT_STEP, 0] == pytest.approx(step)
+    for k, s in enumerate(shipped.geometry.stages()):
+        ring = math.radians(s.hysteresis.value) * s.l.value / s.ld_prime.value
+        assert shipped.p[PLAY + k, 0] == pytest.approx(ring)
     made = build_plant(model=Model(parameters={"actuator.flow_gain": value_of("actuator.flow_gain") * 1.01}))
     assert (made.p != SHIPPED.p).any() and np.array_equal(build_plant().p, SHIPPED.p)
 
@@ -467,7 +506,7 @@ def test_names_of_parameters_belong_to_the_kind_of_actuator() -> None:
     assert motor["drive.rated_current"] == hydraulic["valve.rated_current"]
     for names in (hydraulic, motor):
         assert len(set(names.values())) == len(names) and not any("vgv3" in n for n in names)
-    for machine in (SHIPPED, ELECTRIC):
+    for machine in (build_plant(), build_plant("plant_electromechanical.toml")):
         names = [n.name for n in machine.nominal]
         lengths = [f"linkage.{v}_{key}" for v in OWN for key in ("lc", "l")]
         assert names == [*names_of(machine.kind, OWN), *lengths]
@@ -484,12 +523,6 @@ def test_a_plant_of_no_known_kind_is_refused(text: str, says: str, tmp_path: Pat
     (tmp_path / "p.toml").write_text(text)
     with pytest.raises(InputError, match=says):
         read_plant(tmp_path / "p.toml")
-
-
-def test_the_converter_s_step_is_its_range_over_its_bits() -> None:
-    sensors = SHIPPED.table.sensors
-    step = 1e-3 * sensors.lvdt_range.value / 2 ** int(sensors.lvdt_bits.value)
-    assert SHIPPED.p[nominal_parameters.LVDT_STEP, 0] == pytest.approx(step)
 
 
 def test_which_way_a_chain_runs_follows_from_its_effects() -> None:
@@ -634,6 +667,17 @@ def test_a_geometry_assembles_over_the_whole_stroke_and_no_farther_than_it_does(
             linkage.assembly_range(g, k, high + 1e-3)
 
 
+def test_a_linkage_is_tried_every_tenth_of_a_millimetre_and_to_half_a_metre(monkeypatch: pytest.MonkeyPatch) -> None:
+    g, asked = SHIPPED.geometry.arrays(), []
+    monkeypatch.setattr(linkage, "_fault", lambda stroke, g, k: asked.append((k, stroke)) or (0, 0.0, 0.0, 0.0))
+    linkage.check_assembly(g)
+    assert asked == [(k, x) for k in range(3) for x in np.linspace(-2e-3, 50e-3, 521).tolist()]
+    asked.clear()
+    linkage.check_assembly(g, 0.01, 0.01)
+    assert asked == [(k, 0.01) for k in range(3) for _ in range(2)]
+    assert linkage.assembly_range(g, 1) == pytest.approx((0.024 - 0.5, 0.024 + 0.5), abs=1.5e-3)
+
+
 # ---- in space --------------------------------------------------------------------------------------------------------
 
 
@@ -655,6 +699,27 @@ def test_a_lever_pin_s_clearance_is_felt_whole() -> None:
     assert width == pytest.approx(math.degrees(0.2 / s.l.value), rel=0.05)
     assert clearance_width(g, "vigv", Clearances()) == pytest.approx(0.0, abs=1e-9)
     assert clearance_width(g, "vigv", Clearances(ring=0.5), vane=0.0) == pytest.approx(0.0, abs=0.02)
+
+
+def test_a_width_is_the_ring_s_mean_over_the_stroke_and_each_joint_s_that_of_it_alone() -> None:
+    g, given = load_geometry(), Clearances(actuator=0.1, crank_link=0.1, ring=0.4)
+    ratio = g.vgv1.l.value / g.vgv1.ld_prime.value
+    out, back = clearance_loop(g, "vgv1", np.linspace(0.0, 48.0, 13), given)
+    rings = [np.arctan(ratio * np.sin(np.radians(a))) for a in (out, back)]
+    assert clearance_width(g, "vgv1", given) == pytest.approx(np.degrees((rings[1] - rings[0]).mean() / ratio))
+    for how in ({}, {"vane": -60.0}, {"offset": 8.0}):
+        alone = contributions(g, "vgv1", given, **how)
+        assert alone == {
+            joint: clearance_width(g, "vgv1", Clearances(**{joint: getattr(given, joint)}), **({"vane": -90.0} | how))
+            for joint in Clearances.__dataclass_fields__
+        }
+    at_rest = contributions(g, "vgv1", given)
+    assert contributions(g, "vgv1", given, -90.0, 0.0) == at_rest and at_rest["crank_pivot"] == 0.0
+    assert at_rest["ring"] != contributions(g, "vgv1", given, -60.0)["ring"]
+    width = at_rest["ring"] + 0.05
+    found = clearance_for(g, "vgv1", width, Clearances(), "ring")
+    assert found == clearance_for(g, "vgv1", width, Clearances(), "ring", -90.0, 0.0) != 0.4
+    assert clearance_for(g, "vgv1", width, Clearances(), "ring", -60.0) > found
 
 
 def test_a_width_that_no_clearance_gives_is_refused() -> None:
