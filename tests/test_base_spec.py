@@ -5,11 +5,17 @@ side by side, what a command prints, compiled code that is kept.
 from __future__ import annotations
 
 import argparse
+import errno
 import gc
+import io
 import json
 import math
 import os
-from collections.abc import Callable
+import sys
+import termios
+import threading
+import types as types_of_python
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -17,7 +23,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 from numba import njit, types
-from numba.core import compiler, config
+from numba.core import codegen, compiler, config, errors
 from pydantic import BaseModel, Field, ValidationError
 from scipy.interpolate import CubicSpline
 
@@ -67,6 +73,11 @@ def test_a_period_in_a_name_is_above_nothing_and_no_end(name: str, channel: str,
     assert found == ((channel, pytest.approx(period)) if channel else None)
     assert durations.within_no_period(name) == (channel or name)
     assert durations.period_of(name) == (pytest.approx(period) if channel == "time" else 0.0)
+
+
+def test_a_number_is_whole_to_ten_digits() -> None:
+    for x, whole in ((5.0, True), (1e6 + 1e-5, True), (1e6 + 1e-3, False), (0.5, False), (5.0 + 1e-7, False)):
+        assert durations._whole(x) == whole, x
 
 
 def test_a_channel_s_period_is_written_without_a_dot() -> None:
@@ -134,11 +145,18 @@ def test_a_table_of_no_known_kind_says_which_there_are() -> None:
 def test_what_is_written_is_brought_to_the_disk_with_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: list[Path] = []
     there = os.readlink
-    monkeypatch.setattr(files.os, "fsync", lambda fd: synced.append(Path(there(f"/proc/self/fd/{fd}"))))
+    sizes: list[int] = []
+
+    def sync(fd: int) -> None:
+        synced.append(Path(there(f"/proc/self/fd/{fd}")))
+        sizes.append(os.fstat(fd).st_size)
+
+    monkeypatch.setattr(files.os, "fsync", sync)
     monkeypatch.chdir("/")
     target = files.write(tmp_path / "a.txt", "text")
     assert target.read_text() == "text" and [p.parent for p in synced[:-1]] == [tmp_path] * (len(synced) - 1)
     assert synced[-1] == tmp_path and len(synced) > 1  # the file before it takes its name, the folder after
+    assert sizes[:-1] == [4] * (len(sizes) - 1)  # and all of it
     monkeypatch.chdir(tmp_path)
     files.write("b.txt", b"bytes")
     assert synced[-1] == tmp_path and (tmp_path / "b.txt").read_bytes() == b"bytes"
@@ -513,6 +531,150 @@ def test_progress_is_drawn_on_a_terminal_alone(monkeypatch: pytest.MonkeyPatch) 
     assert drawn == [("work of 1.0", first), ("work of 1.0", second), "end"]
 
 
+def test_control_characters_are_shown() -> None:
+    assert terminal.clean("a\x1b[31m\n\u202eb\udc80") == "a\\x1b[31m\\x0a\\u202eb\\udc80"
+    assert terminal.clean("a\nb\tc\x7f\x9f\xa0", lines=True) == "a\nb\\x09c\\x7f\\x9f\xa0"
+    assert terminal.clean("\x1f \u2027\u2028\u2065\u2069\u206a") == "\\x1f \u2027\\u2028\u2065\\u2069\u206a"
+
+
+class Told(io.StringIO):
+    """A stream that says when it is flushed."""
+
+    flushed = 0
+
+    def flush(self) -> None:
+        self.flushed += 1
+
+
+def test_what_a_command_wrote_is_out_when_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    out = Told()
+    monkeypatch.setattr(sys, "stdout", out)
+
+    def command() -> int:
+        out.flushed = 0
+        return 0
+
+    assert terminal.run(command) == 0 and out.flushed >= 1
+    monkeypatch.setattr(sys, "stdout", None)
+    assert terminal.run(lambda: 0) == 0
+
+
+def test_output_is_written_whole_or_refused_once() -> None:
+    read, write = os.pipe()
+    out = terminal._Output(write, "w")
+    os.set_blocking(write, False)
+    data = bytes(300_000)  # more than a pipe holds: it waits for the reader
+    got: list[bytes] = []
+
+    def reads() -> None:
+        while sum(map(len, got)) < len(data):
+            got.append(os.read(read, 1 << 16))
+
+    reader = threading.Thread(target=reads)
+    reader.start()
+    assert out.write(data) == 300_000 and not out.isatty()
+    reader.join()
+    assert b"".join(got) == data and out.write(memoryview(np.arange(3.0))) == 24 and len(os.read(read, 99)) == 24
+    os.close(read)
+    with pytest.raises(terminal.ReaderGone):
+        out.write(b"x")
+    assert out.write(b"more") == 4 and out.dead  # what comes after it is dropped
+    out.close()
+    with terminal._Output("/dev/full", "w") as full:
+        with pytest.raises(InputError, match="standard output: cannot be written .No space left on device"):
+            full.write(b"x")
+        assert full.write(b"y") == 1
+    with terminal._Complaints("/dev/full", "w") as nobody:
+        assert nobody.write(b"x") == 1 and nobody.dead
+
+
+def test_standard_streams_are_there_and_as_they_were_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = io.StringIO(), io.StringIO()
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, f"__{name}__", None)
+        monkeypatch.setattr(sys, name, ours)
+    monkeypatch.setattr(sys, "stdin", None)
+    with terminal.standard_streams():
+        assert sys.stdin.read() == "" and sys.stdout is sys.stderr is ours  # a program's own stay
+    assert sys.stdin is None
+    monkeypatch.setattr(sys, "__stdout__", ours)
+    monkeypatch.setattr(sys, "__stderr__", theirs)
+    monkeypatch.setattr(sys, "stderr", theirs)
+    opened: list[Any] = []
+    fstat = os.fstat
+
+    def closed(fd: int) -> os.stat_result:
+        if fd == 1:
+            raise OSError(errno.EBADF, "closed")
+        return fstat(fd)
+
+    monkeypatch.setattr(terminal, "_wrapped", lambda kind, fd, stream: (kind, fd, stream))
+    monkeypatch.setattr(terminal.os, "fstat", closed)
+    monkeypatch.setattr(terminal.os, "open", lambda name, how: opened.append((name, how)) or 99)
+    monkeypatch.setattr(terminal.os, "set_inheritable", lambda fd, may: opened.append((fd, may)))
+    with terminal.standard_streams():
+        assert sys.stdout == (terminal._Output, 1, ours) and sys.stderr == (terminal._Complaints, 2, theirs)
+    assert sys.stdout is ours and sys.stderr is theirs and opened == [(os.devnull, os.O_RDWR), (99, True)]
+
+
+def test_a_stream_is_wrapped_with_its_encoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Kind(terminal._Output):
+        def __init__(self, at: Any, *how: Any, **more: Any):
+            asked.append((at, how, more))
+            super().__init__(str(tmp_path / "out"), "w")
+
+    asked: list[Any] = []
+    for fd, stream, encoding, lines in (
+        (1, SimpleNamespace(encoding="latin-1"), "latin-1", False),
+        (2, SimpleNamespace(encoding="ascii"), "ascii", True), (1, None, "utf-8", False),
+    ):  # fmt: skip
+        made = terminal._wrapped(Kind, fd, stream)
+        made.write("\udc80\u20ac")
+        assert (made.encoding, made.line_buffering, made.errors) == (encoding, lines, "backslashreplace")
+        made.close()
+    given = ("w",), {"closefd": False}
+    assert asked == [(1, *given), (2, *given), (os.devnull, ("w",), {})]
+    monkeypatch.setattr(terminal, "is_terminal", lambda stream: True)
+    assert terminal._wrapped(Kind, 1, None).line_buffering
+
+
+@pytest.fixture
+def typed() -> Iterator[Any]:
+    """A terminal that controls nobody."""
+    master, slave = os.openpty()
+    yield SimpleNamespace(fileno=lambda: slave)
+    os.close(master)
+    os.close(slave)
+
+
+def test_keys_come_at_once_on_the_terminal_that_controls_this_process(
+    typed: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def waits_for_lines() -> bool:
+        return bool(termios.tcgetattr(typed.fileno())[3] & termios.ICANON)
+
+    assert terminal.is_terminal(typed) and not terminal.is_terminal(object())
+    assert not terminal.is_terminal(SimpleNamespace(fileno=lambda: -1))
+    with terminal.keyboard(typed) as fd:
+        assert fd is None and waits_for_lines()
+    monkeypatch.setattr(terminal.os, "tcgetpgrp", lambda fd: os.getpgrp() + 1)
+    with terminal.keyboard(typed) as fd:
+        assert fd is None and waits_for_lines() and terminal.input_of(typed) is None
+    for group in (os.getpgrp(), 0):
+        monkeypatch.setattr(terminal.os, "tcgetpgrp", lambda fd, group=group: group)
+        assert terminal.input_of(typed) == typed.fileno()
+        with terminal.keyboard(typed) as fd:
+            assert (fd == typed.fileno()) == (not waits_for_lines()) == bool(group)
+        assert waits_for_lines()
+    with terminal.keyboard(object()) as fd:
+        assert fd is None and terminal.input_of(object()) is None
+    monkeypatch.undo()
+    read, write = os.pipe()
+    assert terminal.input_of(SimpleNamespace(fileno=lambda: read)) == read
+    os.close(read)
+    os.close(write)
+
+
 # ---- compiled code ---------------------------------------------------------------------------------------------------
 
 
@@ -560,6 +722,36 @@ def test_code_is_kept_found_and_forgotten(tmp_path: Path, monkeypatch: pytest.Mo
     (tmp_path / "ahead" / "own" / made.name).rename(made)
     again._cache.flush()
     assert not made.exists() and not kept.is_kept(again) and kept.is_kept(twice)
+
+
+def test_names_and_kinds_of_numbers_are_in_a_function_s_digest() -> None:
+    def digest(source: str, **space: Any) -> str:
+        exec(source, {"__name__": "mine", "math": math, **space}, own := {})
+        made = types_of_python.FunctionType(own["f"].__code__, {"__name__": "mine", "math": math, **space}, "f")
+        return kept.digest_of(made)
+
+    digests = [digest(f"def f(x): return {text}") for text in ("math.sin(x)", "math.cos(x)")]
+    digests += [digest(f"def f({name}): return {name}") for name in "xy"]
+    digests += [digest("def f(x): return k * x", k=k) for k in (np.float32(1.0), np.float32(2.0), np.int8(1))]
+    for stamp in ("one", "two"):
+        digests.append(digest("def f(x): return g(x)", g=SimpleNamespace(vaneloop_digest=stamp)))
+    assert all(digests) and len(set(digests)) == len(digests)
+
+
+def test_what_is_changed_inside_numba(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not lean.is_known():
+        return
+    for of, name in ((compiler.Flags, "__eq__"), (compiler.Flags, "__hash__"), (types.BaseFunction, "get_call_type"),
+                     (codegen.CPUCodeLibrary, "_optimize_functions"),
+                     (type(errors.termcolor()), "_markup")):  # fmt: skip
+        monkeypatch.setattr(of, name, lambda self, *_: "as it comes")
+    lean._change_numba()
+    flags: Any = compiler.Flags
+    assert (flags.__eq__, flags.__hash__) == (lean._same_flags, lean._hash_of_flags)
+    assert codegen.CPUCodeLibrary._optimize_functions is lean._optimise_functions
+    assert type(errors.termcolor())._markup is lean._plain
+    assert types.BaseFunction.get_call_type.__qualname__.startswith("_remembering.")
+    assert types.BaseFunction.get_call_type(SimpleNamespace(), None, (), {"k": 1}) == "as it comes"
 
 
 def test_the_latest_files_of_users_functions_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -288,6 +288,8 @@ def test_an_excerpt_has_half_its_pieces_evenly(monkeypatch: pytest.MonkeyPatch) 
     for fitted, many in ((3000, 5), (600, 2), (0, 2), (3599, 5)):
         chain: Any = long.excerpted(whole.log, whole.grid, machine, fitted)
         assert asked.pop() == (9, many) and chain.rows == [(0, 600)] and chain.whole.chosen == (0,)
+    long.excerpted(whole.log, whole.grid, machine)
+    assert asked == [(9, 200)]  # of 120,000 rows
 
 
 def sums(name: str, hot: Sequence[int], pieces: int, first: int = 0, outputs: tuple[str, ...] = ("y",)) -> Sums:
@@ -350,7 +352,7 @@ def test_a_stretch_is_simulated_with_what_leads_to_it(monkeypatch: pytest.Monkey
     thetas = np.array([[7.0, 5.0, 2.0]])
     long._WORK[:] = [(replace(whole, bind=bind), chain, {"a": (thetas, np.array([0.25, 0.75]))})]
     assert long._stretch(1) == ["sums"]
-    assert asked == [([(9600 - 300, 12_000)], long.ONE_DRAW)]
+    assert asked == [([(9600 - 300, 12_000)], 1)]
     of, floor, moved, first, behind, block = made[0]
     assert of.name == "a" and floor.tolist() == [0.75] == of.floor.tolist() and moved.tolist() == [[7.0, 5.0, 2.0]]
     assert (first, behind, block) == (96, 120, 100)
@@ -863,6 +865,8 @@ def test_stages_of_a_long_log_have_the_errors_of_all_of_it(monkeypatch: pytest.M
     chain: Any = SimpleNamespace(
         whole="whole", stages=[], stage=lambda name: stage(name, ("y", "z") if name == "a" else ("y",))
     )
+    long.located(chain)
+    assert asked.pop()[2] == 2
     out, same = long.located(chain, None, 5)
     assert same is held and out[1] is found[1] and asked[0][0] is chain and asked[0][2] == 5
     (name, (given, fitted), floor, left), _ = asked[0][1]
@@ -901,3 +905,331 @@ def test_verbs_tell_a_system_from_a_machine(monkeypatch: pytest.MonkeyPatch) -> 
     assert by == [bound, "first", None] and said.diagnosis.notes == ["by log"] and said.by_log is by_log
     monkeypatch.setattr(search, "_extended", lambda *a: ("extended", *a))
     assert search.extend("r.csv", ["law"], own) == ("extended", bound, "r.csv", ["law"], None)
+
+
+# ---- learning on a system --------------------------------------------------------------------------------------------
+
+
+class Own:
+    """Stands for what `learn` calls on a system's logs: what each part was asked, and what it says."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, verdict: str = "learned", errors: Sequence[float] = (2.0, 1.5)):
+        models, answers = "vaneloop.discrepancy.models", "vaneloop.discrepancy.stage_answer"
+        self.asked: dict[str, list[Any]] = {}
+        self.told: list[float] = []
+        self.judge = SimpleNamespace(
+            stage=SimpleNamespace(parameters=("k",), neutral=lambda: np.array([9.0, 0.0, 0.0])),
+            fit=self.note("fit", "base fit"),
+        )
+        self.tried = [
+            SimpleNamespace(candidate=n, judge=self.judge, fit=f"fit of {n}", curves=[(0, SimpleNamespace(name=n))])
+            for n in "ab"
+        ]
+        self.tried[1].curves = [*self.tried[0].curves, *self.tried[1].curves]
+        self.outcome = Outcome(verdict, tried=list(self.tried), why="why")
+        self.learner = SimpleNamespace(
+            learned=lambda: self.outcome, judge="judge", base=SimpleNamespace(theta=np.array([7.0]))
+        )
+        self.by_log = SimpleNamespace(model=Model(meta={"x": 1}), json=dict)
+        self.errors = errors
+        for at, said in (
+            (f"{models}.learning.Learner", self.learner), (f"{models}.curved.OwnGround", "ground"),
+            (f"{models}.curved.on_logs", "logs on"), (f"{answers}.rms_of", 4.0), (f"{answers}.found_of", "found"),
+            (f"{answers}.answer_of", self.answer()), (f"{models}.by_log.ByLog.of", self.by_log),
+        ):  # fmt: skip
+            monkeypatch.setattr(at, self.note(at.rpartition(".")[2], said))
+        monkeypatch.setattr(f"{models}.learned.law_of", self.law_of)
+        monkeypatch.setattr(f"{models}.spoken.spoken", lambda learner, tried, laws: (tried[0], laws[:1]))
+        monkeypatch.setattr(learn, "_without", lambda judge, fit, names, n: f"without {n}" if len(names) > 1 else None)
+        monkeypatch.setattr(learn, "_as_model", self.note("as_model", "the model"))
+        logs = SimpleNamespace(fitted=None, test=None)
+        self.diagnosed: Any = search.Diagnosed(
+            "bound",
+            SimpleNamespace(stages=["first", "second"]),
+            "r.csv",
+            SimpleNamespace(logs=logs),  # type: ignore[arg-type]
+        )
+
+    def answer(self) -> Any:
+        """A stage's answer."""
+        return SimpleNamespace(criterion="")
+
+    def note(self, name: str, said: Any) -> Any:
+        """A function that keeps what it is asked."""
+        return lambda *a, **how: self.asked.setdefault(name, []).append(a) or said
+
+    def law_of(self, ground: Any, before: Any, tried: Any) -> Any:
+        """A law."""
+        self.asked.setdefault("law_of", []).append((ground, before, tried.candidate))
+        return law(tried.candidate, error_after=self.errors["ab".index(tried.candidate)])
+
+    def learned(self, formulas: bool = False) -> Any:
+        """What `learn` makes of it."""
+        return learn._learned(self.diagnosed, None, self.told.append, ("odd",), formulas)
+
+
+def test_laws_of_a_system_are_held_against_its_model_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = Own(monkeypatch)
+    said = own.learned()
+    assert own.asked["Learner"] == [("ground", "first", own.told.append, ("odd",), False)]
+    assert own.asked["law_of"] == [
+        ("ground", ("judge", own.learner.base), "a"), ("ground", (own.judge, "fit of a"), "b"),
+    ]  # fmt: skip
+    ((names, theta, steps),) = own.asked["fit"]
+    assert (names, theta.tolist(), steps) == ((), [7.0, 0.0, 0.0], 1)  # its own parameters as fitted, no curve
+    assert own.asked["found_of"] == [(own.judge, "fit of b", ("a", "b"), {"a": "without a", "b": "without b"})]
+    ((judge, verdict, base, fitted, found, fall),) = own.asked["answer_of"]
+    assert (judge, verdict, base, fitted, found) == (own.judge, "missing", "base fit", "fit of b", "found")
+    assert fall == [("nominal", 4.0), ("a + b", 4.0)]
+    ((logs, d, added),) = own.asked["of"]
+    assert (logs, d.criterion, added) == ("logs on", "error_share", None) and own.told == [1.0]
+    assert own.asked["on_logs"] == [(own.diagnosed.by_log.logs, own.tried[1].curves)]
+    assert said.model == "the model" and said.by_log is own.by_log and [x.name for x in said.laws] == ["a", "b"]
+    assert own.asked["as_model"][0][0] == own.by_log.model and own.asked["as_model"][0][3] is own.tried[1]
+
+
+def test_formulas_that_do_as_well_are_the_laws(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = Own(monkeypatch)
+    said = own.learned(formulas=True)
+    assert [x.name for x in said.laws] == ["a"] and said.outcome.tried == own.tried[:1]
+    assert own.asked["found_of"] == [(own.judge, "fit of a", ("a",), {"a": "base fit"})]  # nothing else is left
+    none = Own(monkeypatch, "unknown").learned()
+    assert none.laws == [] and none.model is None and none.log == "r.csv" and none.by_log is None
+
+
+@pytest.mark.parametrize("beside", [None, "beside"])
+def test_learning_on_a_system_diagnoses_first(beside: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    told: list[float] = []
+
+    def made(name: str, said: Any) -> Any:
+        def of(*a: Any, progress: Any = None, **how: Any) -> Any:
+            asked.append((name, a, how))
+            tell = progress or next(x for x in a if callable(x))
+            tell(0.4)
+            return said
+
+        return of
+
+    monkeypatch.setattr(learn, "diagnose", made("diagnose", "diagnosed"))
+    monkeypatch.setattr(learn, "_learned", made("alone", "alone"))
+    monkeypatch.setattr(learn, "_beside_named", made("beside", beside))
+    model, before = system(), Model()
+    said = learn.learn("r.csv", model, fit="0:1", added=before, without=["x"], shape=["odd"], progress=told.append)
+    assert said == (beside or "alone") and told == pytest.approx([0.2, 0.6, 0.85, 1.0])
+    how = {"fit": "0:1", "test": (), "added": before, "without": ["x"]}
+    assert asked[0] == ("diagnose", ("r.csv", model), how)
+    assert asked[1][1][:2] == ("diagnosed", before) and asked[1][1][3:] == (("odd",), True)
+    assert asked[2][1][:2] == ("diagnosed", "alone") and asked[2][1][3:] == (("odd",), True)
+
+    def fails(*_: Any, **how: Any) -> Any:
+        raise StageError("a stage: cannot run")
+
+    monkeypatch.setattr(learn, "_learned", fails)
+    with pytest.raises(InputError, match="^a stage: cannot run"):
+        learn.learn("r.csv", model)
+
+
+def test_learning_on_a_machine_takes_its_chain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(search, "chain_for", lambda log, machine, fit, test: ((log, machine, fit, test), "a.csv"))
+    monkeypatch.setattr(search, "not_given", lambda chain, without: (*chain, *without))
+    monkeypatch.setattr(learn, "learned", lambda *a: a)
+    machine = Machine(model=Model(meta={"x": 1}))
+    said: Any = learn.learn("a.csv", machine, fit="0:1", test="1:2", without=["x"], shape=["odd"], workers=3)
+    chain, log, before, workers, _, found, shape, formulas = said
+    assert chain == ("a.csv", machine, "0:1", "1:2", "x") and (log, before, workers) == ("a.csv", machine.added, 3)
+    assert (found, shape, formulas) == (None, ("odd",), True)
+    assert learn.learn("a.csv")[0][1] == Machine() and learn.learn("a.csv", formulas=False)[7] is False  # type: ignore[index]
+
+
+def test_the_first_law_is_written_as_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Surface(SimpleNamespace):
+        pass
+
+    monkeypatch.setattr("vaneloop.discrepancy.models.learned_surface.LearnedSurface", Surface)
+    monkeypatch.setattr("vaneloop.discrepancy.models.python_law.python_law", lambda law, system: f"{law.name} {system}")
+    monkeypatch.setattr("vaneloop.discrepancy.models.python_surface.python_surface", lambda law: f"surface {law.name}")
+    own: Any = "pump"
+    laws = [law("one"), law("two")]
+    assert answer("learned", laws).write_python(tmp_path / "l.py", own) == tmp_path / "l.py"
+    assert (tmp_path / "l.py").read_text() == "one pump"
+    answer("learned", [Surface(name="s"), law("two")]).write_python(tmp_path / "l.py")
+    assert (tmp_path / "l.py").read_text() == "surface s"
+
+
+class Beside(Own):
+    """Laws of the library that leave more than noise, and what is learned beside them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, excess: float = 4.0, after: float = 1.2, **more: Any):
+        super().__init__(monkeypatch)
+        fitted = SimpleNamespace(system="sys", data=SimpleNamespace(records=["r"]), floor=np.ones(2), thinned="thin")
+        by_logs = SimpleNamespace(fitted=fitted, test=None)
+        named = SimpleNamespace(effects=more.get("effects", ["valve_lag"]), excess=excess,
+                                final=SimpleNamespace(effects=("valve_lag", "spring")))  # fmt: skip
+        self.by = SimpleNamespace(logs=by_logs, model="by model", steps={"model": 1}, tested=lambda: {"t": 1.0})
+        self.of: Any = search.Diagnosed("bound", Diagnosis([named]), "r.csv", self.by)  # type: ignore[arg-type]
+        floor = more.get("floor", np.array([1.0, 1.0]))
+        self.again = SimpleNamespace(fitted=SimpleNamespace(thinned="thin", floor=floor))
+        self.given = SimpleNamespace(verdict="missing")
+        self.bound: list[Any] = []
+        d = SimpleNamespace(error_after=np.array([2.0, 2.0]))
+        tested = more.get("tested", 1.0)
+        self.with_them = SimpleNamespace(
+            d=d, steps={"model": 2, "a": 3, "a + b": 4}, tested=lambda floor: {"t": tested}, json=dict
+        )
+        laws = [law("first", error_after=9.0), law("last", error_after=after)] if more.get("found", True) else []
+        self.said = learn.Learned(self.of, Outcome("learned", notes=[]), laws, self.with_them, log="x")  # type: ignore[arg-type]
+        models = "vaneloop.discrepancy.models.by_log"
+        monkeypatch.setattr(f"{models}.bind", lambda *a: self.bound.append(a) or self.again)
+        monkeypatch.setattr(f"{models}.as_given", lambda logs, fit: self.given)
+        monkeypatch.setattr("vaneloop.discrepancy.fit.Judge", lambda stage, floor: self.judge)
+        monkeypatch.setattr(learn, "_learned", lambda again, *a: self.bound.append((again, *a)) or self.said)
+
+    def beside(self, alone: Any = None) -> Any:
+        """What is learned beside the named ones."""
+        alone = alone or learn.Learned(self.of, Outcome("unknown"), [])
+        return learn._beside_named(self.of, alone, self.told.append, ("odd",), False)
+
+
+@dataclass
+class Diagnosis:
+    """What all stages say."""
+
+    stages: list[Any]
+
+
+def test_curves_are_learned_beside_the_laws_that_have_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    at = Beside(monkeypatch)
+    said = at.beside()
+    assert said.diagnosed is at.of and said.laws == at.said.laws and at.bound[0] == ("sys", ["r"], (), "by model")
+    again, before, _, shape, formulas = at.bound[1]
+    assert again.diagnosis.stages == [at.given] and at.given.verdict == "unknown" and again.bound is at.again.fitted
+    assert (before, shape, formulas) == ("by model", ("odd",), False)
+    assert at.with_them.steps == {"model": 1, "valve_lag + spring + a": 3, "valve_lag + spring + a + b": 4}
+    assert said.outcome.notes == ["learned beside valve_lag and spring of the library: the law file has both"]
+    ((names, theta, steps),) = at.asked["fit"]
+    assert (names, theta.tolist(), steps) == ((), [9.0, 0.0, 0.0], 12)
+    at.by.logs.test = SimpleNamespace(data=SimpleNamespace(records=["t"]))
+    at.beside()
+    assert at.bound[2] == ("sys", ["r"], ["t"], "by model")
+
+
+@pytest.mark.parametrize("change, better", [
+    ({}, True), ({"effects": []}, False), ({"excess": 1.25}, False), ({"excess": 1.3, "after": 1.0}, True),
+    ({"found": False}, False), ({"excess": 2.0, "after": 1.84}, True), ({"excess": 2.0, "after": 1.85}, False),
+    ({"tested": 1.1}, True), ({"tested": 1.11}, False),
+    ({"excess": 2.0, "after": 1.0, "floor": np.full(2, 2.0)}, False),
+    ({"excess": 2.0, "after": 0.9, "floor": np.full(2, 2.0)}, True),
+])  # fmt: skip
+def test_what_is_learned_beside_must_do_better(
+    change: dict[str, Any], better: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fifth less of what exceeds the noise of the first model, and no test log a tenth worse."""
+    assert (Beside(monkeypatch, **change).beside() is not None) == better
+
+
+def test_what_was_learned_alone_stands_where_it_does_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    at = Beside(monkeypatch)
+    alone = learn.Learned(at.of, Outcome("learned"), [law(error_after=9.0), law(error_after=1.2)])
+    assert at.beside(alone) is None  # what it leaves is noise
+    at = Beside(monkeypatch, after=1.28, tested=1.3)
+    worse = SimpleNamespace(tested=lambda: {"t": 1.3})
+    alone = learn.Learned(at.of, Outcome("learned"), [law(error_after=1.4)], worse)  # type: ignore[arg-type]
+    assert at.beside(alone) is not None  # held against the test logs of what was learned alone
+
+    def fails(*_: Any) -> Any:
+        raise StageError("does not run")
+
+    monkeypatch.setattr("vaneloop.discrepancy.models.by_log.bind", fails)
+    assert Beside(monkeypatch).beside() is not None
+    monkeypatch.setattr("vaneloop.discrepancy.models.by_log.bind", fails)
+    assert at.beside() is None
+
+
+# ---- extending -------------------------------------------------------------------------------------------------------
+
+
+def extending(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A chain of two stages, and what is fitted in them."""
+    asked: list[Any] = []
+    monkeypatch.setattr(search, "extend_stage", lambda stage, names, **how: SimpleNamespace(
+        stage=stage.name, effects=[], recalibrated=[], names=names, on=stage))  # fmt: skip
+    monkeypatch.setattr(search, "as_compared", lambda stage, answer: answer)
+    monkeypatch.setattr(search, "no_better", lambda answer: "no better" if answer.stage == "linkage" else None)
+    monkeypatch.setattr(search, "changed", lambda chain, change: change(chain))
+    ground = "vaneloop.discrepancy.models.vane_stages.ground"
+    monkeypatch.setattr(f"{ground}.with_laws", lambda stage, names, curves, log: SimpleNamespace(
+        name=stage.name, given=(tuple(names), tuple(curves), log)))  # fmt: skip
+    monkeypatch.setattr(f"{ground}.curve_effect", lambda name, law: (name, law.values))
+
+    @dataclass
+    class Shown:
+        stages: list[Any]
+        not_observed: Any
+        notes: Any = ("n",)
+        whole: Any = None
+        plant: Any = field(default_factory=lambda: SimpleNamespace(kind="hydraulic"))
+
+        def stage(self, name: str) -> Any:
+            return next(s for s in self.stages if s.name == name)
+
+    chain = Shown([SimpleNamespace(name="actuator"), SimpleNamespace(name="linkage")], {"engine": "no n_r"})
+    return chain, asked
+
+
+def test_effects_are_fitted_in_the_first_stage_that_shows_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    chain, _ = extending(monkeypatch)
+    before = Model(curves={"bend": CURVE}, effects={"bend": {"c1": 7.0}, "rotor_lag_error": {}, "lvdt_bias": {}})
+    said = search.extended(chain, ["valve_lag", "valve_lag", "bend"], before, "a.csv")
+    shown = {s.stage: s for s in said.diagnosis.stages}
+    assert shown["actuator"].names[0] == "bend" and shown["actuator"].names[-1] == "valve_lag"
+    names, curves, log = shown["actuator"].on.given
+    assert "bend" not in names and curves == (("bend", [7.0, 2.0, 3.0, 4.0]),) and log == "a.csv"
+    assert said.bound.stage("linkage").given[1] == () and said.diagnosis.notes == ["n"]
+    assert said.refused == ("no better" if "linkage" in shown else "") and 0.0 <= said.diagnosis.elapsed_s < 60.0
+    assert said.diagnosis.verdict == "missing" and said.diagnosis.not_observed == {"engine": "no n_r"}
+    assert said.held is None and said.model is not None and said.model.curves == {"bend": CURVE}
+    chain.whole = "whole"
+    monkeypatch.setattr(search, "held_results", lambda bound, results: (results, HELD))
+    said = search.extended(chain, ["valve_lag"], Model(), "a.csv")
+    assert said.held is HELD and said.diagnosis.notes == ["n", str(HELD.failing[0])]
+
+
+def test_what_the_log_does_not_show_cannot_be_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    chain, _ = extending(monkeypatch)
+    with pytest.raises(
+        InputError, match=r"a.csv: --effect rotor_lag_error: the log does not show its stage .engine: no n_r"
+    ):
+        search.extended(chain, ["rotor_lag_error"], Model(), "a.csv")
+    with pytest.raises(InputError, match="--effect gear_backlash: not of an actuator of kind hydraulic"):
+        search.extended(chain, ["gear_backlash"], Model(), "a.csv")
+    curve = CURVE.model_copy(update={"at": "engine.demand"})
+    with pytest.raises(InputError, match=r"--effect bend: the log does not show its stage .engine: no n_r"):
+        search.extended(chain, ["bend"], Model(curves={"bend": curve}), "a.csv")
+    chain.not_observed = {}
+    with pytest.raises(InputError, match=r"--effect rotor_lag_error: .*engine: not observed"):
+        search.extended(chain, ["rotor_lag_error"], Model(), "a.csv")
+    with pytest.raises(InputError, match=r"--effect bend: .*engine: not observed"):
+        search.extended(chain, ["bend"], Model(curves={"bend": curve}), "a.csv")
+    assert search.extended(chain, [], Model(effects={"rotor_lag_error": {}}), "a.csv").diagnosis.stages == []
+
+
+def test_laws_of_a_system_are_those_that_it_can_be_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    answer_ = SimpleNamespace(stage="a")
+    by_log = SimpleNamespace(model="by model", notes=["by log"])
+    monkeypatch.setattr(search, "extend_stage", lambda *a, **how: asked.append((a, how)) or answer_)
+    monkeypatch.setattr("vaneloop.discrepancy.models.by_log.ByLog.of", lambda *a: asked.append(a) or by_log)
+    effects = (SimpleNamespace(name="force.spring"), SimpleNamespace(name="force.friction"))
+    bound = SimpleNamespace(stage=SimpleNamespace(effects=effects), present={"force.damper"}, thinned="thin",
+                            system=SimpleNamespace(name="pump"))  # fmt: skip
+    logs: Any = SimpleNamespace(fitted=bound)
+    for better, refused in ((None, ""), ("no better", "no better")):
+        monkeypatch.setattr(search, "no_better", lambda r, better=better: better)
+        said = search._extended(logs, "r.csv", ["force.spring", "force.spring"], None)
+        assert said.refused == refused and said.model == "by model" and said.diagnosis.notes == ["by log"]
+        assert asked[-2][0] == ("thin", ("force.spring",)) and asked[-1] == (logs, answer_, None)
+        assert said.diagnosis.verdict == "missing" and 0.0 <= said.diagnosis.elapsed_s < 60.0 and said.by_log is by_log
+    for law_, why in (("force.damper", "it is part of the model already"), ("force.sprung", "close: force.spring")):
+        with pytest.raises(InputError, match=f"--effect '{law_}': not a law that system 'pump' can be given; {why}"):
+            search._extended(logs, "r.csv", [law_], None)
