@@ -848,6 +848,7 @@ def test_a_list_names_logs_by_path_from_its_folder_or_by_name(tmp_path: Path) ->
         ("", "has the columns ; needed"),
         ("path,time\nx,\ny,soon\n", r"list.csv:3: time \(='soon'\) must be a date such as 2026-03-14T12:30"),
         ('path,time\n"x', "--engines .*list.csv: cannot be read as CSV"),
+        ("path,time,path\na,b,c\n", "--engines .*list.csv: has the column 'path' more than once; allowed: once"),
     ],
 )
 def test_a_list_that_says_nothing_of_logs_is_refused(tmp_path: Path, text: str, says: str) -> None:

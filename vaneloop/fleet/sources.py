@@ -124,6 +124,8 @@ def text_table(file: str, option: str) -> tuple[list[str], list[dict[str, str]]]
         with open(file, encoding="utf-8-sig", newline="") as text:
             rows = csv.DictReader(text, restval="", strict=True)
             have = [str(name).strip() for name in rows.fieldnames or []]
+            if twice := next((name for i, name in enumerate(have) if name in have[:i]), None):
+                raise InputError(f"{option} {file}: has the column {twice[:60]!r} more than once; allowed: once")
             return have, [
                 dict(zip(have, (unmarked(v).strip() for v in list(row.values())[: len(have)]), strict=True))
                 for row in rows
