@@ -763,6 +763,12 @@ def test_results_become_tables_in_the_order_of_paths(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"--tables-out .*file: cannot be written \("):
         tables.write_tables(db, tmp_path / "file")
+    before = {f.name: f.read_bytes() for f in out[0].parent.iterdir()}
+    db.execute("CREATE VIEW broken AS SELECT error('a full disk') AS x")
+    (out[0].parent / "broken.parquet").write_text("what was there")
+    with pytest.raises(InputError, match="cannot be written"):
+        tables.write_tables(db, out[0].parent, ("broken",))
+    assert {f.name: f.read_bytes() for f in out[0].parent.iterdir()} == {**before, "broken.parquet": b"what was there"}
     progress = (
         "SELECT current_setting('enable_progress_bar'), current_setting('threads'), current_setting('temp_directory')"
     )

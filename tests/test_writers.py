@@ -69,8 +69,6 @@ REASONS = {
     ("vaneloop/fleet/leases.py", "open"): "a sign of life: harmless where it is cut",
     ("vaneloop/fleet/reader.py", "fdopen"): PIPE,
     ("vaneloop/fleet/reader.py", "open"): "a lock, which has no content",
-    ("vaneloop/fleet/tables.py", "execute"): "DuckDB writes beside the target",
-    ("vaneloop/fleet/tables.py", "replace"): "of what DuckDB has written whole",
     ("vaneloop/fleet/worker.py", "open"): "a list of failures, appended to line by line",
     ("vaneloop/web/chosen_log.py", "save"): PRIVATE,
     ("vaneloop/web/private.py", "open"): "a lock, which has no content",

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from vaneloop.base.cells import FORMULA
 from vaneloop.base.errors import InputError
+from vaneloop.base.files import whole
 from vaneloop.fleet.folder import KEY, STATUSES, Folder
 
 if TYPE_CHECKING:
@@ -211,10 +212,10 @@ def write_tables(db: duckdb.DuckDBPyConnection, to: str | Path, tables: tuple[st
         for table in tables:
             for suffix, how in (("parquet", "FORMAT parquet, COMPRESSION zstd"), ("csv", "FORMAT csv, HEADER")):
                 file = folder / f"{table}.{suffix}"
-                temporary = folder / f".{table}.{suffix}.part"
                 rows = _marked(db, table) if suffix == "csv" else f"SELECT * FROM {table}"
-                db.execute(f"COPY ({rows}) TO '{_quoted(str(temporary))}' ({how})")
-                out.append(temporary.replace(file))
+                with whole(file) as part:
+                    db.execute(f"COPY ({rows}) TO '{_quoted(str(part))}' ({how})")
+                out.append(file)
     except (OSError, duckdb.Error) as e:
         raise InputError(f"--tables-out {folder}: cannot be written ({str(e).splitlines()[0]})") from None
     return out
