@@ -22,6 +22,7 @@ from vaneloop.discrepancy.models.tried import Outcome
 from vaneloop.discrepancy.stage import Effect, Parameter, Stage
 from vaneloop.discrepancy.whole import BLOCKS, Failing, Sums
 from vaneloop.verbs import learn, long, parts, search
+from vaneloop.verbs import replay as replay_verb
 from vaneloop.verbs.long import Held, Whole
 from vaneloop.verbs.machine import TABLES, Machine, files_of
 
@@ -392,7 +393,7 @@ def test_a_search_goes_on_once_where_the_whole_log_fails(monkeypatch: pytest.Mon
     monkeypatch.setattr(long, "weigh", weighed.append)
     monkeypatch.setattr(long, "verdict_of", lambda stages: f"verdict of {stages}")
     chain, d, _ = long.searched(Excerpt((3, 9)), 2, told.append, words.append)
-    new = tuple(k for k in range(3, 30) if k not in (3, 9))[: long.MORE]
+    new = tuple(k for k in range(3, 30) if k not in (3, 9))[:10]
     assert chosen == [(3, 9), (3, 9, *new)] and chain.stages == chosen[1]
     assert told == pytest.approx([0.15, 0.4, 0.65, 0.9]) and [n.fraction for n in words] == pytest.approx(told)
     assert words[0].text == "tries" and words[0].found == "f" and words[1].text == "held against the whole log"
@@ -1233,3 +1234,62 @@ def test_laws_of_a_system_are_those_that_it_can_be_given(monkeypatch: pytest.Mon
     for law_, why in (("force.damper", "it is part of the model already"), ("force.sprung", "close: force.spring")):
         with pytest.raises(InputError, match=f"--effect '{law_}': not a law that system 'pump' can be given; {why}"):
             search._extended(logs, "r.csv", [law_], None)
+
+
+def test_of_a_surface_what_goes_on_is_its_range(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Surface(SimpleNamespace):
+        pass
+
+    monkeypatch.setattr("vaneloop.discrepancy.models.learned_surface.LearnedSurface", Surface)
+    second = {"of": "t_oil", "low": 10.0, "high": 20.0, "form": "line"}
+    formula = SimpleNamespace(form="line", numbers={"a": 3.0})
+    made = Surface(**vars(law("s", spoken=formula, axis=lambda: second)))
+    outcome: Any = SimpleNamespace(tried=[tried()])
+    table = learn._as_model(Model(), outcome, [made], outcome.tried[0]).curves["s"]
+    assert (table.low, table.high, table.reach) == (0.0, 300.0, []) and table.second is not None
+    assert table.second.of == "t_oil"
+
+
+def test_a_log_is_read_where_it_is_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr("hil.logs.read_log", lambda path, **how: asked.append((path, how)) or "the log")
+    log = Log("a.csv", {"n_dem": Channel(T, 60.0 + T)})
+    assert replay_verb.log_of(log, Machine()) is log and asked == []
+    for name in ("a.csv", Path("a.csv")):
+        assert replay_verb.log_of(name, Machine(), ()) == "the log"
+        assert asked.pop() == (name, {"require": (), "tables": files_of(None)})
+    replay_verb.log_of("a.csv", Machine())
+    assert asked.pop()[1]["require"] == ("n_dem",)
+    monkeypatch.setattr(replay_verb, "run", lambda log, **how: (log, how))
+    machine = Machine(model=Model(effects={"lvdt_bias": {"bias": 0.1}}))
+    for given, m in ((machine, machine), (None, Machine())):
+        found, how = replay_verb.replay(log, given, floors={"vigv": 0.1}).result  # type: ignore[misc]
+        assert found is log and how["floors"] == {"vigv": 0.1} and how["progress"] is None
+        assert (
+            how["plant"].p.tolist() == m.plant.p.tolist() and how["calibration"].k.tolist() == m.calibration.k.tolist()
+        )
+
+
+def test_stages_are_compared_and_told_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[float] = []
+    bound: Any = SimpleNamespace(not_observed={"b": "x"}, test=None)
+    monkeypatch.setattr("vaneloop.pages.diagnosis.located_sentence", lambda *a: a)
+    assert search.Stages(bound, ["x"]).sentence() == (["x"], {"b": "x"}, ())  # type: ignore[comparison-overlap, list-item]
+    said: Any = search.Stages(bound, [], held=HELD).sentence()
+    assert said == ([], {"b": "x"}, HELD.failing)
+    monkeypatch.setattr(search, "located_of", lambda chain, tell: ([tell and tell(0.5, "a")], HELD))
+    found = search.compared(bound, "a.csv", "locate", told.append)
+    assert told == [0.5] and found.held is HELD and (found.log, found.verb, found.bound) == ("a.csv", "locate", bound)
+    assert search.compared(bound, "a.csv").located == [None] and told == [0.5]
+
+
+def test_effects_are_left_out_of_every_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "vaneloop.discrepancy.models.vane_stages.ground.without_laws", lambda stages, effects: (stages, effects)
+    )
+    monkeypatch.setattr(search, "changed", lambda chain, change: change(chain))
+    chain: Any = Stages([], stages="stages")
+    assert search.not_given(chain, []) is chain
+    assert search.not_given(chain, ["valve_lag"]).stages == ("stages", ["valve_lag"])  # type: ignore[comparison-overlap]
+    with pytest.raises(InputError, match="--without 'valve_leg' is not in the library"):
+        search.not_given(chain, ["valve_leg"])
