@@ -17,7 +17,7 @@ from vaneloop.cli.main import COMMANDS
 
 NAMES = [*COMMANDS, *MODULES]
 LOG = str(ROOT / "examples" / "hidden_effect.parquet")
-MISSING = "/no/such/file"
+MISSING = "/dev/null/no/such/file"  # which nobody can make, either
 REFUSING = ("full", "hung up")  # as standard output
 
 
