@@ -150,7 +150,7 @@ def test_a_controller_that_crashes_is_a_failed_machine_and_not_the_end(tmp_path:
     run_out = tmp_path / "run"
     read, quantities, folder = campaign.begin(plan, run_out, 3600.0)
     campaign.take_samples(read, quantities, folder)
-    work(folder.path)
+    work(folder.path, trust=folder.job["machine"])
     view = campaign.judge(read, quantities, folder, lambda fraction: None)
     ours, theirs = view.groups
     assert (ours.failed, theirs.failed) == (0, 4) and view.passed(ours) and not view.passed(theirs)
@@ -175,11 +175,12 @@ def test_calibrations_and_firmwares_of_one_s_own_and_a_kill_within_a_trial(tmp_p
     plan.write_text(plan.read_text().replace("samples = 16\nsearch = 16\nsensitivity = 8", "samples = 4\nsearch = 0"))
     read, quantities, folder = campaign.begin(plan, tmp_path / "run", 3600.0)
     assert campaign.take_samples(read, quantities, folder) == 8
-    script = "import sys; from vaneloop.fleet.worker import work; work(sys.argv[1])"
+    script = "import sys; from vaneloop.fleet.worker import work; work(sys.argv[1], trust=sys.argv[2])"
     env = {**os.environ, "VANELOOP_FLEET_KILL": "begin:3"}
-    killed = subprocess.run([sys.executable, "-c", script, str(folder.path)], env=env, cwd=ROOT, check=False)
+    words = [sys.executable, "-c", script, str(folder.path), folder.job["machine"]]
+    killed = subprocess.run(words, env=env, cwd=ROOT, check=False)
     assert killed.returncode == -signal.SIGKILL
-    assert work(folder.path) == {"done": 6}, "two were done, the third is done again"
+    assert work(folder.path, trust=folder.job["machine"]) == {"done": 6}, "two were done, the third is done again"
     view = campaign.judge(read, quantities, folder, lambda fraction: None)
     assert [g.name for g in view.groups] == ["still.soft.shipped", "still.soft.mine"]
     for g in view.groups:

@@ -5,6 +5,7 @@ The logs are a stand-in's (tests/fleet_jobs.py), so that a run takes a second; t
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
@@ -648,8 +649,10 @@ def test_a_dask_scheduler_that_is_killed_is_one_line_and_the_run_goes_on(
         assert started.returncode == 2 and "the Dask scheduler has gone" in err, err
     finally:
         for p in [*cluster, *([started] if started else [])]:
-            for child in psutil.Process(p.pid).children(recursive=True) if p.poll() is None else []:
-                child.kill()
+            with contextlib.suppress(psutil.NoSuchProcess):  # some end by themselves meanwhile
+                for child in psutil.Process(p.pid).children(recursive=True):
+                    with contextlib.suppress(psutil.NoSuchProcess):
+                        child.kill()
             p.kill()
             p.wait()
     (tmp_path / "logs" / "e1" / "slow.csv").unlink()

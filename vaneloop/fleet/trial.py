@@ -56,7 +56,7 @@ class _Answer(BaseModel):
     point: list[Finite]
     held: bool
     margins: list[_Margin]
-    state_hash: str
+    state_hash: str | None  # None: the controller did not run to the end
     seen: list[str]
     runs: int = 0
 

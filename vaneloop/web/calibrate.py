@@ -126,7 +126,7 @@ class Calibrate:
         for i, (field, reference) in self.fields.items():
             factor = t.elements[i].factor
             value, was = (shown(page[i] / factor) for page in t.pages)
-            if not field.is_deleted and field.value != value:
+            if not field.is_deleted and field.value != value and i not in t.asked:
                 field.set_value(value)
             if not reference.is_deleted:
                 reference.set_text(f"reference {was}")

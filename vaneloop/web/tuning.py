@@ -47,6 +47,7 @@ class Tuning:
         self.saved: list[Path] = []
         self._waiting: dict[int, asyncio.Future[list[bytes] | str]] = {}
         self._number = 0
+        self.asked: set[int] = set()  # numbers whose change is under way: their fields show what was typed
 
     @property
     def folder(self) -> Path:
@@ -92,6 +93,7 @@ class Tuning:
             self._do(self._refused(f"{e.name} (={text!r}) must be a number, in {e.border or '-'}"))
             return
         if self.pages.shape[1] and shown(value) != shown(self.pages[0, number] / e.factor):
+            self.asked.add(number)
             self._do(self._change(number, value))
 
     def use(self, page: int) -> None:
@@ -157,6 +159,7 @@ class Tuning:
         try:
             answers = await self._ask(master.write_number(number, value * e.factor), what)
         finally:
+            self.asked.discard(number)
             self.session.touch("calibrate")  # the field shows again what is
         self.pages[0, number] = np.frombuffer(answers[-1], "<f8")[0]
         if self.page == 0:
