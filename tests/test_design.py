@@ -180,6 +180,20 @@ def test_the_gap_is_total_not_half() -> None:
     assert play_describing_function(0.5, gap) == 0.0
 
 
+def servo_with_play(x: float, y: float, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Time (s) and position of 1 / (s (s + 1)) under K = 4, whose position comes back through a play of 0.4: a
+    simulation in steps of 1 ms from the position ``x`` with the play at ``y``.
+    """
+    v, h = 0.0, 1e-3
+    t, out = h * np.arange(samples), np.empty(samples)
+    for n in range(samples):
+        v += h * (-4.0 * y - v)
+        x += h * v
+        y = min(max(y, x - 0.2), x + 0.2)
+        out[n] = x
+    return t, out
+
+
 def test_textbook_servo_with_backlash() -> None:
     """A motor 4/(s (s + 1)) with play of +-0.2 in its feedback oscillates with A = 0.33 at 1.24 rad/s (read off the
     Nyquist plot).
@@ -188,14 +202,7 @@ def test_textbook_servo_with_backlash() -> None:
     4, D = 0.2, whose simulation shows A = 0.33 and a period of about 5.0 s. Both are readings of plots, quoted without
     the notes at hand; so the servo is simulated here once more.
     """
-    x, v, y, h = 1.0, 0.0, 0.8, 1e-3
-    t, out = h * np.arange(80_000), np.empty(80_000)
-    for n in range(t.size):
-        v += h * (-4.0 * y - v)
-        x += h * v
-        y = min(max(y, x - 0.2), x + 0.2)
-        out[n] = x
-    seen = steady_cycle(t, out, 0.01)
+    seen = steady_cycle(*servo_with_play(1.0, 0.8, 80_000), 0.01)
     assert seen is not None
     assert (seen.amplitude, seen.omega) == (pytest.approx(0.33, abs=0.01), pytest.approx(2 * math.pi / 5.0, rel=0.04))
 

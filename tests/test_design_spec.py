@@ -16,6 +16,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
+from tests.test_design import servo_with_play
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path
 from vaneloop.design import servo, servo_design
@@ -397,14 +398,7 @@ def test_with_harmonics_the_cycle_is_that_of_the_servo_in_time() -> None:
     (first,) = limit_cycles(servo_loop, 0.4, 0.1, 20.0)
     better = harmonic_balance(servo_loop, 0.4, first, 200.0)
     assert better is not None
-    x, v, y, h = 0.33, 0.0, 0.2, 1e-3
-    t, out = h * np.arange(60_000), np.empty(60_000)
-    for n in range(t.size):
-        v += h * (-4.0 * y - v)
-        x += h * v
-        y = min(max(y, x - 0.2), x + 0.2)
-        out[n] = x
-    seen = steady_cycle(t, out, 0.01)
+    seen = steady_cycle(*servo_with_play(0.33, 0.2, 60_000), 0.01)
     assert seen is not None
     assert (better.amplitude, better.omega) == pytest.approx((seen.amplitude, seen.omega), rel=4e-3)
     assert abs(better.omega / seen.omega - 1) < 0.5 * abs(first.omega / seen.omega - 1)

@@ -412,43 +412,34 @@ def test_whatever_hangs_is_ended(gcc: str, tmp_path: Path, case: str) -> None:
         isolated(lambda: in_lockstep(calibration), patience=0.5)
 
 
+def interrupted(ready: Path, first: Callable[[], object] = lambda: None) -> Callable[[], None]:
+    """A task without end. Once it has done what is ``first``, this process gets Ctrl-C."""
+
+    def task() -> None:
+        first()
+        ready.touch()
+        while True:
+            time.sleep(0.1)
+
+    def interrupt() -> None:
+        while not ready.exists():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    return task
+
+
 def test_who_does_not_hear_an_interrupt_is_ended(gcc: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hil.native.isolation._ENDING", 0.3)
     calibration = with_program(wrong(gcc, tmp_path, init="signal(SIGINT, SIG_IGN);"))
-    ready = tmp_path / "ready"
-
-    def task() -> None:
-        in_lockstep(calibration)
-        ready.touch()
-        while True:
-            time.sleep(0.1)
-
-    def interrupt() -> None:
-        while not ready.exists():
-            time.sleep(0.01)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    threading.Thread(target=interrupt).start()
     with pytest.raises(ControllerFailed, match=r"did not end within 0\.3 s of SIGINT"):
-        isolated(task)
+        isolated(interrupted(tmp_path / "ready", lambda: in_lockstep(calibration)))
 
 
 def test_an_interrupt_ends_the_run_of_a_good_controller(gcc: str, tmp_path: Path) -> None:
-    ready = tmp_path / "ready"
-
-    def task() -> None:
-        ready.touch()
-        while True:
-            time.sleep(0.1)
-
-    def interrupt() -> None:
-        while not ready.exists():
-            time.sleep(0.01)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    threading.Thread(target=interrupt).start()
     with pytest.raises(KeyboardInterrupt):
-        isolated(task)
+        isolated(interrupted(tmp_path / "ready"))
 
 
 DESCRIBES = {

@@ -8,12 +8,8 @@ as the writers of the formats where speed matters less, and as the source of the
 
 from __future__ import annotations
 
-import logging
-from array import array
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,17 +17,10 @@ from hil.logs import plausible
 from hil.logs.source import LogError
 from vaneloop.base.files import whole
 
-__all__ = [
-    "DISORDER_S", "EXTENDED", "Frames", "FramesOfRecord", "frames_in_order", "frames_of", "in_order",
-    "write_through_can",
-]  # fmt: skip
+__all__ = ["DISORDER_S", "EXTENDED", "Frames", "frames_in_order", "in_order", "write_through_can"]
 
 EXTENDED = 1 << 31  # flag in `Frames.ident`, as socketcan sets it
 DISORDER_S = 0.050  # loggers that merge several channels swap frames by a few ms; more is a clock that jumped
-
-
-# frames of a recording: us since 1970 (int64[n]), both words (int64[n, 2], `hil.bus.frames`), whether it sent them
-FramesOfRecord = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -100,25 +89,6 @@ def frames_in_order(
     t, order = in_order(name, t, notes)
     t = t[order]
     return Frames(t - t[:1], ident[order], bus[order], length[order], data[order], notes)
-
-
-def frames_of(messages: Iterable[Any], notes: str | int) -> FramesOfRecord:
-    """Frames that a reader of python-can gives, 32 bytes each; it logs a line for each that it cannot read. Those on
-    the channel ``notes`` are the loop's own notes (`hil.bus.frames.NOTE`).
-    """
-    from hil.bus.frames import NOTE, from_message
-
-    found, can = array("q"), logging.getLogger("can")
-    level = can.level
-    can.setLevel(logging.CRITICAL)
-    try:
-        for m in messages:
-            head, data = from_message(m)
-            found.extend((round(m.timestamp * 1e6), head | NOTE * (m.channel == notes), data, not m.is_rx))
-    finally:
-        can.setLevel(level)
-    table = np.array(found, np.int64).reshape(-1, 4)
-    return table[:, 0], table[:, 1:3], table[:, 3] != 0
 
 
 def write_through_can(path: Path, frames: Frames, writer: str) -> None:

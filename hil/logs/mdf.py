@@ -24,9 +24,9 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from hil.logs.bus_log import encode_channels, open_bus_log
-from hil.logs.frames import EXTENDED, Frames, FramesOfRecord, frames_of, in_order
+from hil.logs.frames import EXTENDED, Frames, in_order
 from hil.logs.names import meaning
-from hil.logs.record_formats import NOTE_CHANNEL
+from hil.logs.record_formats import NOTE_CHANNEL, FramesOfRecord, frames_of
 from hil.logs.source import Channel, LogError, Options, Series, Source, check_file, find, names_held, read_bytes
 from vaneloop.base.child import python
 from vaneloop.base.extras import needs

@@ -13,10 +13,13 @@ A note of the loop is in each of them a frame on a channel of its own.
 from __future__ import annotations
 
 import io
+import logging
 import os
 import re
 import struct
 import zlib
+from array import array
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -26,8 +29,23 @@ if TYPE_CHECKING:
     import can
 
 __all__ = [
-    "ERROR", "EXTENDED", "FD", "FRAME", "NOTE_CHANNEL", "NOTE_KIND", "NOTE_NAME", "REMOTE", "BlfRecord",
-    "CandumpRecord", "MdfRecord", "RecordFormat", "append_whole", "messages", "packed_message",
+    "ERROR",
+    "EXTENDED",
+    "FD",
+    "FRAME",
+    "NOTE_CHANNEL",
+    "NOTE_KIND",
+    "NOTE_NAME",
+    "REMOTE",
+    "BlfRecord",
+    "CandumpRecord",
+    "FramesOfRecord",
+    "MdfRecord",
+    "RecordFormat",
+    "append_whole",
+    "frames_of",
+    "messages",
+    "packed_message",
 ]  # fmt: skip
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29  # in `ident`, as SocketCAN has them
@@ -51,6 +69,10 @@ FD = 4  # in `flags`; 1 is the bit-rate switch, 2 the error state, as SocketCAN 
 NOTE_NAME, NOTE_CHANNEL, NOTE_KIND = "vaneloop.note", 254, "note"
 
 
+# frames of a recording: us since 1970 (int64[n]), both words (int64[n, 2], `hil.bus.frames`), whether it sent them
+FramesOfRecord = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
 class RecordFormat(Protocol):
     """A file that can be appended to and is whole after every append."""
 
@@ -59,6 +81,25 @@ class RecordFormat(Protocol):
 
     def close(self) -> None:
         """End the file."""
+
+
+def frames_of(messages: Iterable[Any], notes: str | int) -> FramesOfRecord:
+    """Frames that a reader of python-can gives, 32 bytes each; it logs a line for each that it cannot read. Those on
+    the channel ``notes`` are the loop's own notes (`hil.bus.frames.NOTE`).
+    """
+    from hil.bus.frames import NOTE, from_message
+
+    found, can = array("q"), logging.getLogger("can")
+    level = can.level
+    can.setLevel(logging.CRITICAL)
+    try:
+        for m in messages:
+            head, data = from_message(m)
+            found.extend((round(m.timestamp * 1e6), head | NOTE * (m.channel == notes), data, not m.is_rx))
+    finally:
+        can.setLevel(level)
+    table = np.array(found, np.int64).reshape(-1, 4)
+    return table[:, 0], table[:, 1:3], table[:, 3] != 0
 
 
 def append_whole(fd: int, data: bytes) -> None:

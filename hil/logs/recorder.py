@@ -26,7 +26,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hil.logs.blf import whole_blf
-from hil.logs.frames import FramesOfRecord, frames_of
 from hil.logs.mdf import read_record_mdf
 from hil.logs.record_formats import (
     ERROR,
@@ -35,8 +34,10 @@ from hil.logs.record_formats import (
     NOTE_NAME,
     BlfRecord,
     CandumpRecord,
+    FramesOfRecord,
     MdfRecord,
     RecordFormat,
+    frames_of,
     packed_message,
 )
 from hil.logs.record_parquet import ParquetRecord, read_parquet

@@ -7,10 +7,8 @@ served from stale code; the folder carries that digest in its name, too, so that
 
 from __future__ import annotations
 
-import atexit
 import os
 import shutil
-import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -21,6 +19,7 @@ from numba import njit
 
 from vaneloop.base.kept import is_kept, keep, sources_digest
 from vaneloop.base.lean import called_by_code
+from vaneloop.base.temporary import own_folder
 
 __all__ = [
     "cache_folder",
@@ -53,9 +52,7 @@ def cache_folder() -> Path:
             continue
         if os.access(place, os.W_OK):
             return place / f"compiled-{sources_digest()}"
-    own = tempfile.mkdtemp(prefix="vaneloop-")
-    atexit.register(shutil.rmtree, own, ignore_errors=True)
-    return Path(own) / f"compiled-{sources_digest()}"
+    return own_folder("vaneloop-") / f"compiled-{sources_digest()}"
 
 
 if not os.environ.get("NUMBA_CACHE_DIR"):

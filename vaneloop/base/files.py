@@ -11,7 +11,6 @@ import contextlib
 import errno
 import os
 import stat
-import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -132,7 +131,7 @@ def _begin(path: str | Path, only_new: bool = False) -> _Target:
     folder, last = os.path.split(name)
     if not last:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), name)
-    part = os.path.join(folder, f".{last[:40]}.{uuid.uuid4().hex[:12]}.part")
+    part = os.path.join(folder, f".{last[:40]}.{os.urandom(6).hex()}.part")
     try:
         mode = 0o666 if old is None else old.st_mode & 0o666 | 0o200  # no one reads it who may not read the old one
         os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode))

@@ -151,11 +151,7 @@ def command(args: argparse.Namespace) -> int:
         source, timeout=args.timeout, wait=args.wait, mode_request=int(args.mode == "run"),
         ecu=Ecu(machine, n_dem=first, seed=args.seed),
     )  # fmt: skip
-    node: Any = ecu
-    if authenticator is not None:
-        from hil.loop.secured import FROM_CONTROLLER, Secured
-
-        node = Secured(ecu, authenticator, FROM_CONTROLLER, wall_clock())
+    node = station.secured(ecu, authenticator, ecu=True, clock=wall_clock())
     duration = args.duration if args.duration is not None or demand is None else demand.duration
     complaint = ""
     with (

@@ -180,15 +180,6 @@ def _node_json(node: Any) -> dict[str, Any]:
     }
 
 
-def _secured(args: argparse.Namespace, node: Any, authenticator: Any, clock: Any = None) -> Any:
-    """The node with authentication, where that is on."""
-    if authenticator is None:
-        return node
-    from hil.loop.secured import DEMANDED, Secured
-
-    return Secured(node, authenticator, DEMANDED, clock)
-
-
 def _say_tools(args: argparse.Namespace, serviced: Any) -> dict[str, Any]:
     """Say what was lost of tools' frames because more came than a tick has time for; return it for the JSON."""
     if not attended.wanted(args):
@@ -228,7 +219,7 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
     node = _node(args, machine)
     _say_engine(args, machine, name)
     ticks = None if args.duration is None else round(args.duration * 1000)
-    serviced = _secured(args, attended.attend(args, node), authenticator, wall_clock())
+    serviced = station.secured(attended.attend(args, node), authenticator, clock=wall_clock())
     accepted = attended.accepted(args)
     with stop_on_signals() as stop, station.joined(name, args.realtime_priority, can_filters=accepted) as bus:
         port = Port(bus)
@@ -327,13 +318,14 @@ def _in_lockstep(args: argparse.Namespace) -> int:
     machine = options.machine_of(args)
     node = _node(args, machine)
     ecu = Ecu(machine.plant, n_dem=float(profile[0, 0]), seed=None if args.seed is None else args.seed + 1)
-    secured, duration = _secured(args, node, authenticator), args.duration or demand.duration
+    secured = station.secured(node, authenticator)
+    duration = args.duration if args.duration is not None else demand.duration
     start, whole = time.time_ns() // 10**9 * 1000, None
     with terminal.progress_bar(args, "lockstep") as progress:
         if authenticator is not None:
-            from hil.loop.secured import FROM_CONTROLLER, Secured, run_secured
+            from hil.loop.secured import run_secured
 
-            other = Secured(ecu, authenticator, FROM_CONTROLLER)
+            other = station.secured(ecu, authenticator, ecu=True)
             whole = run_secured(profile, secured, other, start=start, duration=duration, progress=progress)
             run = whole.run
         else:
@@ -418,7 +410,7 @@ def _repeat(args: argparse.Namespace) -> int:
             f"record of an earlier vaneloop they are the loop's pauses, and such a record does not repeat"
         )
         terminal.say(args, f"note: {notes[0]}")
-    whole = _secured(args, attended.attend(args, node, recorded=True), authenticator)
+    whole = station.secured(attended.attend(args, node, recorded=True), authenticator)
     if whole is not node:
         from hil.calibrate.station import replay_attended
 

@@ -8,7 +8,7 @@ import os
 import queue
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +64,17 @@ def authenticator(args: argparse.Namespace) -> Any:
     from hil.bus.secoc import Authenticator, read_key
 
     return Authenticator(read_key(args.secoc))
+
+
+def secured(node: Any, authenticator: Any, *, ecu: bool = False, clock: Callable[[], int] | None = None) -> Any:
+    """The controller's node, or the ECU's, with authentication where that is on; ``clock`` as `hil.loop.secured` has
+    it.
+    """
+    if authenticator is None:
+        return node
+    from hil.loop.secured import DEMANDED, FROM_CONTROLLER, Secured
+
+    return Secured(node, authenticator, FROM_CONTROLLER if ecu else DEMANDED, clock)
 
 
 def authentication_words(args: argparse.Namespace) -> str:

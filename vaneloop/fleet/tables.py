@@ -10,10 +10,7 @@ Rows are in the order of path, so that two runs over the same logs give the same
 
 from __future__ import annotations
 
-import atexit
 import json
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
@@ -23,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from vaneloop.base.cells import FORMULA
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import whole
+from vaneloop.base.temporary import own_folder
 from vaneloop.fleet.folder import KEY, STATUSES, Folder
 
 if TYPE_CHECKING:
@@ -166,12 +164,7 @@ def _take(db: duckdb.DuckDBPyConnection, batch: pa.Table) -> None:
                    f"unnest(said.{field}) AS x FROM part WHERE status = 'done')")  # fmt: skip
 
 
-@cache
-def _spilled() -> str:
-    """A folder of this process alone for what does not fit into memory; it goes with the process."""
-    place = tempfile.mkdtemp(prefix="vaneloop-fleet-")
-    atexit.register(shutil.rmtree, place, ignore_errors=True)
-    return place
+_spilled = cache(lambda: str(own_folder("vaneloop-fleet-")))  # what does not fit into memory
 
 
 def database() -> duckdb.DuckDBPyConnection:
