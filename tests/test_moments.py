@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import queue
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -58,7 +59,13 @@ def test_a_log_s_moments_are_its_modes_its_faults_and_what_was_injected() -> Non
     assert [(b.start, b.end, b.text) for b in both] == [(2.0, 9.0, f"{FAULTS[0]}, {FAULTS[1]}")]
 
 
-def test_what_is_injected_in_lockstep_is_marked_at_the_tick_at_which_it_begins() -> None:
+@pytest.fixture
+def inbox(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing that another test told a loop of this process, and that ended before it heard, is heard by this one."""
+    monkeypatch.setattr(loop, "INBOX", queue.Queue())
+
+
+def test_what_is_injected_in_lockstep_is_marked_at_the_tick_at_which_it_begins(inbox: None) -> None:
     told: list[dict[str, Any]] = []
 
     def progress(share: float | None, content: Any) -> None:

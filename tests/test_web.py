@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import json
 import os
+import queue
 import re
 import signal
 import subprocess
@@ -1624,10 +1625,11 @@ def test_the_workbench_of_another_machine_says_so_in_its_commands(tmp_path: Path
     assert plan.geometry.vanes == plan.schedules.vanes == ("vigv", "vgv1", "vgv2", "vgv3")
 
 
-def test_the_live_loop_runs_another_machine(tmp_path: Path) -> None:
+def test_the_live_loop_runs_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from vaneloop.base.vanes import VANES
     from vaneloop.web import loop
 
+    monkeypatch.setattr(loop, "INBOX", queue.Queue())  # what the loop ends before it hears reaches no other test
     told: list[dict[str, Any]] = []
 
     def progress(share: float | None, content: Any) -> None:
