@@ -22,7 +22,7 @@ TESTS ?=
 LONG_TESTS := -m '(slow or hypothesis) and not socketcan' --hypothesis-profile thorough \
   --junitxml out/test-all.xml --durations=15
 # What may differ from one Python to the next: how functions are compiled and kept, processes, the command line, packages.
-SHORT := imports controller plant frames bus node logs record kept discrepancy laws own_laws exit_codes
+SHORT := imports controller plant frames bus node logs record kept identification laws own_laws exit_codes
 # Why tests were skipped: pytest writes it there, and the last lines of `make test-all` say it.
 NOT_TESTED := out/not_tested.txt
 

@@ -18,11 +18,11 @@ import numpy as np
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
-from vaneloop.discrepancy import fit as fitting
-from vaneloop.discrepancy.diagnose import diagnose_stage
-from vaneloop.discrepancy.fit import DIFFERENCE, Fit, Judge
-from vaneloop.discrepancy.search import Search
-from vaneloop.discrepancy.stage import Stage
+from vaneloop.identification.least_squares import problem as fitting
+from vaneloop.identification.least_squares.problem import DIFFERENCE, Fit, Judge
+from vaneloop.identification.selection.diagnosis import diagnose_stage
+from vaneloop.identification.selection.search import Search
+from vaneloop.identification.subsystem import Stage
 
 __all__ = ["in_scipy", "ours"]
 

@@ -113,8 +113,8 @@ def side_by_side() -> Iterator[Row]:
     from hil.logs import read_log
     from plant import build_plant
     from plant.stages import actuator, bends, engine, linkage
-    from vaneloop.discrepancy.models.vane_stages.ground import VaneGround
-    from vaneloop.discrepancy.models.vanes import build_chain
+    from vaneloop.identification.vane_chain.candidates import VaneGround
+    from vaneloop.identification.vane_chain.chain import build_chain
 
     with tempfile.TemporaryDirectory() as folder:
         log = read_log(_rig(Path(folder), "null_over_temperature"), require=())

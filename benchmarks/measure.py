@@ -329,8 +329,8 @@ def against_least_squares() -> Iterator[Row]:
     """The search of a stage against scipy's least squares, one fit after the other, on the example log."""
     from benchmarks.in_scipy import in_scipy, ours
     from hil.logs import read_log
-    from vaneloop.discrepancy.models.vanes import build_chain
-    from vaneloop.discrepancy.workflow import diagnose
+    from vaneloop.identification.vane_chain.chain import build_chain
+    from vaneloop.identification.workflow import diagnose
 
     chain = build_chain(read_log(ROOT / "examples" / "hidden_effect.parquet", require=()))
     stage = chain.stage("actuator")

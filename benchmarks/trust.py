@@ -1,6 +1,6 @@
 """Probabilities that come true: fitted to blind answers, and judged on others.
 
-    python -m benchmarks.trust fit effects.parquet laws.parquet        # coefficients for vaneloop/discrepancy/trust.py
+    python -m benchmarks.trust fit effects.parquet laws.parquet        # coefficients for selection/calibration.py
     python -m benchmarks.trust judge effects2.parquet laws2.parquet    # reliability, Brier score, 90 % set of names
 
 The files are results of `vaneloop hidden-effect` and `vaneloop hidden-law`. Fit and judgement must not see the same
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from vaneloop.cli.blind import share
-from vaneloop.discrepancy.trust import COEFFICIENTS, terms, trust
+from vaneloop.identification.selection.calibration import COEFFICIENTS, terms, trust
 
 RIDGE = 1.0  # observations that a coefficient of 0 is worth: few answers must not make a name certain
 BINS = (0.0, 0.3, 0.6, 0.8, 0.9, 0.95, 1.001)

@@ -13,8 +13,8 @@ __all__ = ["AGREES", "SignalError", "error_figures", "noise_floor", "resolution"
 
 Array = NDArray[np.float64]
 
-# noise floors up to which an error counts as noise: floors are known to some per cent; vaneloop.discrepancy.locate has
-# the same number
+# noise floors up to which an error counts as noise: floors are known to some per cent; vaneloop.identification.regimes
+# has the same number
 AGREES = 1.1
 DESIGN_POINT = (99.0, 100.0)  # % of design speed, open interval: the range of the third figure of the paper's Table 5
 

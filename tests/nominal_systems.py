@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vaneloop import System, unknown
-from vaneloop.discrepancy import Parameter
+from vaneloop.identification import Parameter
 
 __all__ = ["NOMINAL", "nominal"]
 

@@ -87,7 +87,7 @@ def _records(records: list[Record], time: float, factor: dict[str, float]) -> li
 @contextmanager
 def reordered_laws() -> Iterator[None]:
     """The library's laws in reverse order."""
-    from vaneloop.discrepancy.library import LAWS
+    from vaneloop.identification.candidates.library import LAWS
 
     def turn() -> None:
         for laws in LAWS.values():

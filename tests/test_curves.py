@@ -13,12 +13,12 @@ import pytest
 from hil.logs import Channel, Log
 from tests import rig
 from tests.firmware_on_rig import firmware
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.models.vanes import build_chain
-from vaneloop.discrepancy.noise_floor import NoiseFloor
-from vaneloop.discrepancy.search import Search
-from vaneloop.discrepancy.stage_answer import StageDiagnosis
-from vaneloop.discrepancy.workflow import diagnose
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.results import StageDiagnosis
+from vaneloop.identification.selection.likelihood_acceptance import NoiseFloor
+from vaneloop.identification.selection.search import Search
+from vaneloop.identification.vane_chain.chain import build_chain
+from vaneloop.identification.workflow import diagnose
 
 
 def said(seed: int, effect: str, parameters: Mapping[str, float], stage: str) -> StageDiagnosis:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vaneloop.discrepancy.curves import Basis, basis_of
+from vaneloop.identification.candidates.spline_basis import Basis, basis_of
 
 
 def values(basis: Basis, x: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:

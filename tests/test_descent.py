@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 
 from tests.test_search_limits import SIDES, fit_of, judge_of
-from vaneloop.discrepancy import diagnose, workflow
-from vaneloop.discrepancy.carried import NOT_KNOWN, Known
-from vaneloop.discrepancy.descent import carries
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.stage import Effect, Parameter, Stage
+from vaneloop.identification import workflow
+from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known
+from vaneloop.identification.least_squares.levenberg_marquardt import carries
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.selection import diagnosis as diagnose
+from vaneloop.identification.subsystem import Effect, Parameter, Stage
 
 N = 240  # samples
 Array = np.ndarray[Any, Any]

@@ -8,10 +8,10 @@ import pytest
 from hil.logs import Channel, Log
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
-from vaneloop.discrepancy.diagnose import diagnose_stage
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.models.vanes import build_chain
-from vaneloop.discrepancy.stage import Effect, Parameter, Stage
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.selection.diagnosis import diagnose_stage
+from vaneloop.identification.subsystem import Effect, Parameter, Stage
+from vaneloop.identification.vane_chain.chain import build_chain
 
 NOISE = 0.03
 PHASES = (-180, -159, -90, -20, 45, 120)

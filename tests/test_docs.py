@@ -379,7 +379,7 @@ def before(page: str, step: Step, folder: Path) -> dict[str, Any]:
     if page == "docs/learn.md" and not (folder / "cold.csv").is_file():
         run_command("python make_oil.py")
     if page == "docs/your_own_model.md" and "record = " in text:
-        from vaneloop.discrepancy import Record
+        from vaneloop.identification import Record
 
         data = {n: np.loadtxt(folder / f"{n}.csv", delimiter=",", skiprows=1).T for n in ("tank", "other")}
         t, pump, level = data["tank"]

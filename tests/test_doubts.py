@@ -12,12 +12,12 @@ import pytest
 
 import vaneloop
 from tests.conftest import ROOT
-from tests.test_discrepancy import FLOOR, integrator
+from tests.test_identification import FLOOR, integrator
 from tests.test_your_own_model import STRAIGHT, T, cascade, noise, tanks, wave
 from vaneloop import Parameter, Record, System, unknown
-from vaneloop.discrepancy import Stage
-from vaneloop.discrepancy.error_share import ErrorShare
-from vaneloop.discrepancy.workflow import compare_stages, diagnose
+from vaneloop.identification import Stage
+from vaneloop.identification.selection.relative_error_acceptance import ErrorShare
+from vaneloop.identification.workflow import compare_stages, diagnose
 from vaneloop.verbs.search import Diagnosed, Stages
 
 t = np.arange(0.0, 20.0, 0.005)

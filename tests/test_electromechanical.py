@@ -27,7 +27,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path
 from vaneloop.cli.main import main
 from vaneloop.design.servo import ServoPlant, default_gains, margins
-from vaneloop.discrepancy.models.vanes import build_chain
+from vaneloop.identification.vane_chain.chain import build_chain
 from vaneloop.verbs.search import diagnosed
 
 TABLE = "plant_electromechanical.toml"

@@ -22,11 +22,11 @@ from plant.parameters import LVDT_FACTOR
 from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
 from vaneloop.base.forms import FORMS
-from vaneloop.discrepancy.fit import Judge, recalibrate
-from vaneloop.discrepancy.models.vane_stages.declared import FREE
-from vaneloop.discrepancy.models.vanes import Chain, build_chain
-from vaneloop.discrepancy.stage import Parameter, Stage, StageError
-from vaneloop.discrepancy.whiten import FAR, whiten
+from vaneloop.identification.least_squares.problem import Judge, recalibrate
+from vaneloop.identification.least_squares.residuals import FAR, whiten
+from vaneloop.identification.subsystem import Parameter, Stage, StageError
+from vaneloop.identification.vane_chain.chain import Chain, build_chain
+from vaneloop.identification.vane_chain.parameters import FREE
 
 TABLES = ("plant.toml", "plant_electromechanical.toml")
 

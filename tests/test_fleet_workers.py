@@ -1013,15 +1013,15 @@ def test_a_log_of_the_machine_is_diagnosed_with_the_run_s_files(monkeypatch: pyt
 def test_a_log_of_a_system_of_one_s_own_is_read_as_the_system_reads(
     monkeypatch: pytest.MonkeyPatch, reads_itself: bool
 ) -> None:
-    import vaneloop.discrepancy
-    import vaneloop.discrepancy.models.by_log
+    import vaneloop.identification
+    import vaneloop.identification.user_models.by_log
     import vaneloop.verbs.search
 
     seen: list[Any] = []
     system = SimpleNamespace(read=reads_itself)
     record = SimpleNamespace(t="T", columns={"a": np.array([np.nan, 1.0]), "b": np.array([np.nan, np.nan])})
-    monkeypatch.setattr(vaneloop.discrepancy, "load_system", lambda file: system if file == "s" else None)
-    monkeypatch.setattr(vaneloop.discrepancy.models.by_log, "load_model_of", lambda file, system: f"of {file}")
+    monkeypatch.setattr(vaneloop.identification, "load_system", lambda file: system if file == "s" else None)
+    monkeypatch.setattr(vaneloop.identification.user_models.by_log, "load_model_of", lambda file, system: f"of {file}")
     monkeypatch.setattr(vaneloop.verbs.search, "read_record", lambda *a, **k: seen.append((a, k)) or (record, None))
     monkeypatch.setattr(vaneloop.verbs.search, "diagnose", lambda record, system, added: ("said", added))
     found, columns = diagnosis._of_system("/log", {"system": "s", "model": "m"}, {"x": 1})
@@ -1030,7 +1030,7 @@ def test_a_log_of_a_system_of_one_s_own_is_read_as_the_system_reads(
     assert diagnosis._of_system("/log", {"system": "s"}, {})[0] == ("said", None)
 
     def fails(*_: Any, **__: Any) -> None:
-        raise vaneloop.discrepancy.StageError("no column a")
+        raise vaneloop.identification.StageError("no column a")
 
     monkeypatch.setattr(vaneloop.verbs.search, "diagnose", fails)
     with pytest.raises(InputError, match="^no column a$"):

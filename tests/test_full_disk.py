@@ -418,7 +418,7 @@ def test_rows_of_a_blind_benchmark(tmp_path: Path) -> None:
 
 
 def test_a_law_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vaneloop.discrepancy.models.python_law.python_law", lambda *_: "def law(x): return x\n")
+    monkeypatch.setattr("vaneloop.identification.unmodelled.python_law.python_law", lambda *_: "def law(x): return x\n")
     found: Any = SimpleNamespace(laws=[None])
     (tmp_path / "l.py").write_bytes(OLD)
     kept_when_full(tmp_path, lambda: Learned.write_python(found, tmp_path / "l.py"))

@@ -19,11 +19,11 @@ from hil.replay import replay
 from tests.bus_logs import by_ticks, by_wire, with_effect, write_frames
 from vaneloop.base.spans import Span
 from vaneloop.cli.main import main
-from vaneloop.discrepancy.diagnose import diagnose_stage
-from vaneloop.discrepancy.locate import AGREES
-from vaneloop.discrepancy.models.vane_stages.raster import grid_of, on_raster, rms
-from vaneloop.discrepancy.models.vanes import Chain, build_chain
-from vaneloop.discrepancy.stage_answer import StageDiagnosis
+from vaneloop.identification.regimes import AGREES
+from vaneloop.identification.results import StageDiagnosis
+from vaneloop.identification.selection.diagnosis import diagnose_stage
+from vaneloop.identification.vane_chain.chain import Chain, build_chain
+from vaneloop.identification.vane_chain.resample import grid_of, on_raster, rms
 from vaneloop.verbs.parts import part_of
 
 PHASES = range(10)  # ms after the controller's tick at which the ECU's frame is taken
@@ -233,7 +233,7 @@ def test_parts_and_other_clocks_of_a_log_of_frames_stay_frames(tmp_path: Path) -
 
 @pytest.mark.parametrize(("between", "value"), [("hold", 1.0), ("line", 1.5)])
 def test_an_input_in_frames_holds_where_the_model_says_so(between: str, value: float, tmp_path: Path) -> None:
-    from vaneloop.discrepancy.models.system import System
+    from vaneloop.identification.user_models.system import System
     from vaneloop.verbs.search import read_record
 
     frames = read_candump(by_ticks(tmp_path / "run.log", "ramp", 5, seconds=15.0))

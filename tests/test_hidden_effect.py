@@ -22,8 +22,8 @@ from vaneloop.base.tables import path
 from vaneloop.cli.hidden_effect import _named_where, _sizes, _too_easy, draw_case, judge_case, learned_right
 from vaneloop.cli.main import main
 from vaneloop.cli.same_curve import like_it, with_effect
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.models.vanes import build_chain
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.vane_chain.chain import build_chain
 
 N = 200
 

@@ -25,11 +25,12 @@ from vaneloop import Record, System
 from vaneloop.cli import hidden_law
 from vaneloop.cli.blind import as_curve
 from vaneloop.cli.main import main
-from vaneloop.discrepancy import Parameter, laws
-from vaneloop.discrepancy.library import LAWS
-from vaneloop.discrepancy.models import runner
-from vaneloop.discrepancy.models.bound import Bound
-from vaneloop.discrepancy.models.kernel import build_kernels
+from vaneloop.identification import Parameter
+from vaneloop.identification.candidates import laws
+from vaneloop.identification.candidates.library import LAWS
+from vaneloop.identification.user_models import simulation as runner
+from vaneloop.identification.user_models.bound_system import Bound
+from vaneloop.identification.user_models.kernel import build_kernels
 from vaneloop.verbs import search
 
 # sensors whose law the product reads back, to where the state must have been

@@ -26,7 +26,7 @@ from plant import build_plant
 from plant.parameters import PLAY
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
-from vaneloop.discrepancy.locate import AGREES
+from vaneloop.identification.regimes import AGREES
 
 SHIPPED, flashed = build_plant(), cache(load_calibration)
 

@@ -18,7 +18,7 @@ import pytest
 from tests.conftest import ROOT
 from vaneloop.base import terminal
 from vaneloop.base.kept import Waiting, digest_of
-from vaneloop.discrepancy import laws
+from vaneloop.identification.candidates import laws
 
 # Two users' models of the same names, whose helper is too large to be put in place: what is compiled in another process
 # and read from files must not take the one's for the other's.
@@ -26,7 +26,7 @@ CODE = """
 import sys
 import numpy as np
 from numba.core import event
-from vaneloop.discrepancy.models.dispatch import compiled_code
+from vaneloop.identification.user_models.codegen import compiled_code
 
 compiled = []
 class Count(event.Listener):

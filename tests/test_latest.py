@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import ROOT
-from vaneloop.discrepancy import latest
+from vaneloop.identification.least_squares import residuals as latest
 
 
 def test_a_set_that_was_simulated_is_not_simulated_again(monkeypatch):
@@ -43,7 +43,7 @@ def test_a_diagnosis_does_not_import_what_it_does_not_use():
     """Each of them takes up to half a second of processor time."""
     code = (
         "import sys\nfrom hil.logs import read_log\nimport vaneloop.verbs.search\n"
-        "from vaneloop.discrepancy.models.vanes import build_chain\n"
+        "from vaneloop.identification.vane_chain.chain import build_chain\n"
         "build_chain(read_log('examples/hidden_effect.parquet', require=()))\n"
         "print([m for m in ('pandas', 'scipy.signal', 'scipy.stats', 'scipy.optimize', 'scipy.interpolate')\n"
         "       if m in sys.modules])"

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vaneloop.discrepancy import laws
-from vaneloop.discrepancy.laws import PARAMETERS
-from vaneloop.discrepancy.library import FORCE_LAWS, LAWS, SIGNAL_LAWS, STATE_LAWS, Law, Size
+from vaneloop.identification.candidates import laws
+from vaneloop.identification.candidates.laws import PARAMETERS
+from vaneloop.identification.candidates.library import FORCE_LAWS, LAWS, SIGNAL_LAWS, STATE_LAWS, Law, Size
 
 T = np.arange(0.0, 10.0, 0.01)
 U = 2.0 * np.sin(1.3 * T) + 0.4 * np.sin(9.0 * T)
@@ -58,10 +58,9 @@ def test_declared_parameters_hang_together(family: str, law: Law) -> None:
 def test_a_state_that_runs_away_leaves_the_laws_numbers_finite() -> None:
     """A model whose first fit ends in the void: 1e200 is no size of anything."""
     from vaneloop import Record, System, unknown
-    from vaneloop.discrepancy.models.data import Data
-    from vaneloop.discrepancy.models.dispatch import Dispatch
-    from vaneloop.discrepancy.models.nominal import Course
-    from vaneloop.discrepancy.models.places import places
+    from vaneloop.identification.user_models.codegen import Dispatch
+    from vaneloop.identification.user_models.data import Data
+    from vaneloop.identification.user_models.injection_points import Course, places
 
     system = System(
         name="s", kind="simulate", model=lambda x, u, p: (p.a * x.level + u.pump, x.level - x.other),

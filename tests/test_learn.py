@@ -28,21 +28,33 @@ from vaneloop.base.curve import POINTS, on_table
 from vaneloop.base.forms import FORMS
 from vaneloop.base.tables import read
 from vaneloop.cli.blind import as_curve
-from vaneloop.discrepancy import StageError
-from vaneloop.discrepancy.curves import basis_of
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.formulas import begin, text_of
-from vaneloop.discrepancy.models.by_formula import harmless
-from vaneloop.discrepancy.models.by_log import bind
-from vaneloop.discrepancy.models.curve_file import from_file
-from vaneloop.discrepancy.models.curved import OwnGround, candidates, on_logs, with_curves
-from vaneloop.discrepancy.models.formula_fits import fitted_formulas, goes_on
-from vaneloop.discrepancy.models.held_out import held_out, surely_more, told_by_others
-from vaneloop.discrepancy.models.memory import dissipates, lagged, lagged_name, named_lag, of_stops
-from vaneloop.discrepancy.models.quantities import column_of
-from vaneloop.discrepancy.models.steps import best_step, starts_of
-from vaneloop.discrepancy.models.tried import Tried, left_by_its_mean, one_constant
-from vaneloop.discrepancy.stage import Effect, Parameter, Stage
+from vaneloop.identification import StageError
+from vaneloop.identification.candidates.closed_forms import begin, text_of
+from vaneloop.identification.candidates.spline_basis import basis_of
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.subsystem import Effect, Parameter, Stage
+from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas, goes_on
+from vaneloop.identification.unmodelled.curve_candidates import OwnGround, candidates, on_logs, with_curves
+from vaneloop.identification.unmodelled.fitted_candidate import (
+    Tried,
+    held_out,
+    left_by_its_mean,
+    one_constant,
+    surely_more,
+    told_by_others,
+)
+from vaneloop.identification.unmodelled.parametric_preference import harmless
+from vaneloop.identification.unmodelled.screening import best_step, starts_of
+from vaneloop.identification.user_models.by_log import bind
+from vaneloop.identification.user_models.exogenous_regressors import column_of
+from vaneloop.identification.user_models.hysteresis_regressors import (
+    dissipates,
+    lagged,
+    lagged_name,
+    named_lag,
+    of_stops,
+)
+from vaneloop.identification.user_models.law_file import from_file
 from vaneloop.verbs.learn import learn
 from vaneloop.verbs.search import diagnose
 

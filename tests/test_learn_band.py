@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from vaneloop.base.curve import POINTS
-from vaneloop.discrepancy.curves import basis_of
-from vaneloop.discrepancy.models.learned import band_of
+from vaneloop.identification.candidates.spline_basis import basis_of
+from vaneloop.identification.unmodelled.learned_law import band_of
 
 BLOCKS, SAMPLES = 14, 60  # samples of each
 

@@ -10,9 +10,9 @@ import pytest
 from plant import Model
 from vaneloop import Record, System, unknown
 from vaneloop.base.tables import read
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.models.by_log import bind
-from vaneloop.discrepancy.search import Search
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.selection.search import Search
+from vaneloop.identification.user_models.by_log import bind
 from vaneloop.verbs.learn import learn
 
 LATE = 0.7  # s

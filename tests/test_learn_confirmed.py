@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 import vaneloop
 from vaneloop import Record, System, unknown
 from vaneloop.base.forms import FORMS
-from vaneloop.discrepancy.formulas import begin
-from vaneloop.discrepancy.library import FORCE_LAWS
-from vaneloop.discrepancy.models import confirmed
-from vaneloop.discrepancy.models.by_formula import earning_by_formula
-from vaneloop.discrepancy.models.confirmed import OTHER, moves, stands_before
-from vaneloop.discrepancy.models.learning import Learner
-from vaneloop.discrepancy.models.memory import NO_TURN, swings
+from vaneloop.identification.candidates.closed_forms import begin
+from vaneloop.identification.candidates.library import FORCE_LAWS
+from vaneloop.identification.unmodelled import confirmation as confirmed
+from vaneloop.identification.unmodelled.confirmation import OTHER, moves, stands_before
+from vaneloop.identification.unmodelled.learning import Learner
+from vaneloop.identification.unmodelled.parametric_preference import earning_by_formula
+from vaneloop.identification.user_models.hysteresis_regressors import NO_TURN, swings
 
 T = np.linspace(0.0, 28.0, 5601)  # s
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from vaneloop import Record, System, unknown
-from vaneloop.discrepancy.models.by_log import bind
-from vaneloop.discrepancy.models.curved import Candidate, OwnGround
-from vaneloop.discrepancy.models.learning import SPLINES, TIMES, WIGGLES, Learner
-from vaneloop.discrepancy.models.memory import lagged, named_lag
-from vaneloop.discrepancy.models.smoothness import smoothed
-from vaneloop.discrepancy.models.tried import Tried
+from vaneloop.identification.unmodelled.curve_candidates import Candidate, OwnGround
+from vaneloop.identification.unmodelled.fitted_candidate import Tried
+from vaneloop.identification.unmodelled.learning import SPLINES, TIMES, WIGGLES, Learner
+from vaneloop.identification.unmodelled.screening import smoothed
+from vaneloop.identification.user_models.by_log import bind
+from vaneloop.identification.user_models.hysteresis_regressors import lagged, named_lag
 
 SLIDE = System(
     "slide", "static", lambda u, p: p.gain * u.drive, inputs={"drive": "V"}, outputs={"place": "mm"},

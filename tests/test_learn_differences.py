@@ -20,17 +20,17 @@ from plant.model import Learned, Model
 from vaneloop import Record, System, unknown
 from vaneloop.base.tables import read
 from vaneloop.cli.same_law import same_by_equations
-from vaneloop.discrepancy import StageError
-from vaneloop.discrepancy.formulas import Formula
-from vaneloop.discrepancy.models.by_log import bind
-from vaneloop.discrepancy.models.curve_file import from_file
-from vaneloop.discrepancy.models.curved import OwnGround, candidates, with_curves
-from vaneloop.discrepancy.models.known import quantities
-from vaneloop.discrepancy.models.learned import LearnedLaw
-from vaneloop.discrepancy.models.learning import Learner
-from vaneloop.discrepancy.models.python_law import python_law
-from vaneloop.discrepancy.models.quantities import sides_of
-from vaneloop.discrepancy.models.tried import plain
+from vaneloop.identification import StageError
+from vaneloop.identification.candidates.closed_forms import Formula
+from vaneloop.identification.unmodelled.curve_candidates import OwnGround, candidates, with_curves
+from vaneloop.identification.unmodelled.fitted_candidate import plain
+from vaneloop.identification.unmodelled.learned_law import LearnedLaw
+from vaneloop.identification.unmodelled.learning import Learner
+from vaneloop.identification.unmodelled.python_law import python_law
+from vaneloop.identification.unmodelled.regressors import quantities
+from vaneloop.identification.user_models.by_log import bind
+from vaneloop.identification.user_models.exogenous_regressors import sides_of
+from vaneloop.identification.user_models.law_file import from_file
 from vaneloop.verbs.learn import learn
 
 D = "motor_minus_drum"

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.test_learn_vanes import chain
-from vaneloop.discrepancy.error_share import PER_PARAMETER, RIVAL, score
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.models.at_the_noise import above_the_noise, earns, grain_of, unconfirmed
-from vaneloop.discrepancy.models.formula_fits import CLOSE, REFITTED, _nearest
-from vaneloop.discrepancy.models.vane_stages.ground import VaneGround, remade
-from vaneloop.discrepancy.noise_floor import NATS, RIVAL_NATS
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.selection.likelihood_acceptance import NATS, RIVAL_NATS
+from vaneloop.identification.selection.relative_error_acceptance import PER_PARAMETER, RIVAL, score
+from vaneloop.identification.unmodelled.closed_form_fits import CLOSE, REFITTED, _nearest
+from vaneloop.identification.unmodelled.likelihood_acceptance import above_the_noise, earns, grain_of, unconfirmed
+from vaneloop.identification.vane_chain.candidates import VaneGround, remade
 
 N = 30_000
 

@@ -12,15 +12,15 @@ import pytest
 from hil.logs import Channel, Log
 from tests import rig
 from tests.firmware_on_rig import firmware
-from vaneloop.discrepancy.models import by_formula
-from vaneloop.discrepancy.models.by_formula import said_first
-from vaneloop.discrepancy.models.formula_fits import fitted_formulas
-from vaneloop.discrepancy.models.learning import Learner
-from vaneloop.discrepancy.models.smoothness import SCREENED
-from vaneloop.discrepancy.models.tried import Tried
-from vaneloop.discrepancy.models.vane_stages.ground import VaneGround, remade
-from vaneloop.discrepancy.models.vanes import build_chain
-from vaneloop.discrepancy.noise_floor import RIVAL_NATS, correlation_of
+from vaneloop.identification.selection.likelihood_acceptance import RIVAL_NATS, correlation_of
+from vaneloop.identification.unmodelled import parametric_preference as by_formula
+from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
+from vaneloop.identification.unmodelled.fitted_candidate import Tried
+from vaneloop.identification.unmodelled.learning import Learner
+from vaneloop.identification.unmodelled.parametric_preference import said_first
+from vaneloop.identification.unmodelled.screening import SCREENED
+from vaneloop.identification.vane_chain.candidates import VaneGround, remade
+from vaneloop.identification.vane_chain.chain import build_chain
 
 SPEED, STROKE = "actuator.load.curve_of_n_r", "actuator.load.curve_of_x_lvdt"
 

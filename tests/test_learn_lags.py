@@ -22,10 +22,10 @@ from plant.effects import N_STATE
 from tests import rig
 from tests.test_learn_vanes import WIDE, chain, columns, curved, law
 from vaneloop.base.errors import InputError
-from vaneloop.discrepancy.models.memory import lagged
-from vaneloop.discrepancy.models.vane_stages.driven import Made
-from vaneloop.discrepancy.models.vane_stages.ground import LAGGED, VaneGround, curve_effect, with_laws
-from vaneloop.discrepancy.models.vanes import Chain, build_chain
+from vaneloop.identification.user_models.hysteresis_regressors import lagged
+from vaneloop.identification.vane_chain.candidates import LAGGED, VaneGround, curve_effect, with_laws
+from vaneloop.identification.vane_chain.chain import Chain, build_chain
+from vaneloop.identification.vane_chain.subsystem_data import Made
 
 TICK = 1e-3
 SECONDS = 30.0

@@ -26,13 +26,13 @@ from vaneloop import Record, System
 from vaneloop.base.durations import in_name, of_name, period_of, within_no_period
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import read
-from vaneloop.discrepancy import StageError
-from vaneloop.discrepancy.curves import FINE_HARMONICS, waves_of
-from vaneloop.discrepancy.models.curve_file import from_file
-from vaneloop.discrepancy.models.learning import Learner
-from vaneloop.discrepancy.models.periods import Course, Lines
-from vaneloop.discrepancy.models.quantities import every
-from vaneloop.discrepancy.models.tried import Tried
+from vaneloop.identification import StageError
+from vaneloop.identification.candidates.spline_basis import FINE_HARMONICS, waves_of
+from vaneloop.identification.unmodelled.fitted_candidate import Tried
+from vaneloop.identification.unmodelled.learning import Learner
+from vaneloop.identification.unmodelled.spectral_lines import Course, Lines
+from vaneloop.identification.user_models.exogenous_regressors import every
+from vaneloop.identification.user_models.law_file import from_file
 from vaneloop.verbs.learn import learn, learned
 from vaneloop.verbs.search import diagnose, diagnosed
 
@@ -343,7 +343,7 @@ def test_an_oscillating_driver_is_learned_from_a_log_of_the_rig(tmp_path) -> Non
     hidden = rig.draw("driver_oscillation", 3, np.random.default_rng(1))
     run = rig.simulate(rig.manoeuvre(12, 40.0), firmware(), [hidden], seed=12, rate=100, randomised=False)
     log = Log("rig", {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"})
-    from vaneloop.discrepancy.models.vanes import build_chain
+    from vaneloop.identification.vane_chain.chain import build_chain
 
     chain = build_chain(log)
     chain.stages[:] = [s for s in chain.stages if s.name == "actuator"]

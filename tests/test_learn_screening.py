@@ -12,15 +12,15 @@ import pytest
 
 from tests.test_learn_vanes import rig_chain
 from vaneloop import Record, System, unknown
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.models.by_formula import leaves
-from vaneloop.discrepancy.models.by_log import bind
-from vaneloop.discrepancy.models.curved import Candidate, OwnGround
-from vaneloop.discrepancy.models.learning import QUICK, TIMES, Learner
-from vaneloop.discrepancy.models.screening import screened
-from vaneloop.discrepancy.models.tried import Ground, Tried
-from vaneloop.discrepancy.models.vane_stages.ground import VaneGround
-from vaneloop.discrepancy.scout import LITTLE, excerpt_of
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.selection.subsampled_search import LITTLE, excerpt_of
+from vaneloop.identification.unmodelled.curve_candidates import Candidate, OwnGround
+from vaneloop.identification.unmodelled.fitted_candidate import Ground, Tried
+from vaneloop.identification.unmodelled.learning import QUICK, TIMES, Learner
+from vaneloop.identification.unmodelled.parametric_preference import leaves
+from vaneloop.identification.unmodelled.screening import screened
+from vaneloop.identification.user_models.by_log import bind
+from vaneloop.identification.vane_chain.candidates import VaneGround
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from vaneloop.base.curve import on_even, on_table
-from vaneloop.discrepancy import Record, System, unknown
-from vaneloop.discrepancy import descent as steps
-from vaneloop.discrepancy.carried import NOT_KNOWN, Carried, Known, LatestSlopes
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.models import runner
-from vaneloop.discrepancy.models.curved import candidates, with_curves
-from vaneloop.discrepancy.stage import Array, Effect, Parameter, Stage
+from vaneloop.identification import Record, System, unknown
+from vaneloop.identification.least_squares import levenberg_marquardt as steps
+from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Carried, Known, LatestSlopes
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.subsystem import Array, Effect, Parameter, Stage
+from vaneloop.identification.unmodelled.curve_candidates import candidates, with_curves
+from vaneloop.identification.user_models import simulation as runner
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 

@@ -11,10 +11,11 @@ import pytest
 
 from vaneloop.base import side_by_side as sharing
 from vaneloop.base.side_by_side import shared_out, side_by_side
-from vaneloop.discrepancy import Record, System, unknown
-from vaneloop.discrepancy.models import nominal, runner
-from vaneloop.discrepancy.models.dispatch import compiled_code
-from vaneloop.discrepancy.models.smoothness import smoothed
+from vaneloop.identification import Record, System, unknown
+from vaneloop.identification.unmodelled.screening import smoothed
+from vaneloop.identification.user_models import injection_points as nominal
+from vaneloop.identification.user_models import simulation as runner
+from vaneloop.identification.user_models.codegen import compiled_code
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 

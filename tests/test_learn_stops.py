@@ -25,14 +25,14 @@ from vaneloop.base.curve import POINTS
 from vaneloop.base.errors import InputError
 from vaneloop.base.hysteresis import RADII, slipped, weights_of
 from vaneloop.cli.main import main
-from vaneloop.discrepancy.models.confirmed import another_confirms
-from vaneloop.discrepancy.models.learning import Learner
-from vaneloop.discrepancy.models.memory import BEFORE, forgotten, of_stops
-from vaneloop.discrepancy.models.tried import Tried
-from vaneloop.discrepancy.models.vane_stages.driven import Made
-from vaneloop.discrepancy.models.vane_stages.ground import LAGGED, SLIPS, VaneGround, with_laws
-from vaneloop.discrepancy.models.vanes import build_chain
-from vaneloop.discrepancy.stage_answer import rms_of
+from vaneloop.identification.results import rms_of
+from vaneloop.identification.unmodelled.confirmation import another_confirms
+from vaneloop.identification.unmodelled.fitted_candidate import Tried
+from vaneloop.identification.unmodelled.learning import Learner
+from vaneloop.identification.user_models.hysteresis_regressors import BEFORE, forgotten, of_stops
+from vaneloop.identification.vane_chain.candidates import LAGGED, SLIPS, VaneGround, with_laws
+from vaneloop.identification.vane_chain.chain import build_chain
+from vaneloop.identification.vane_chain.subsystem_data import Made
 
 BUSHING = ("linkage.crank adds", "stops_of_x_lvdt", "tanh", -0.8, 1.5)  # takes up to 0.8 mm of the stroke
 GIVE = 1.8  # mm

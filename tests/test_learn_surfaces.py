@@ -29,9 +29,9 @@ from vaneloop.base.curve import SIDE, on_grid
 from vaneloop.base.hull import hull_of, nearest_within, within
 from vaneloop.base.tables import read
 from vaneloop.cli.hidden_law import surface_summary
-from vaneloop.discrepancy import StageError
-from vaneloop.discrepancy.models.curve_file import from_file
-from vaneloop.discrepancy.models.curved import with_curves
+from vaneloop.identification import StageError
+from vaneloop.identification.unmodelled.curve_candidates import with_curves
+from vaneloop.identification.user_models.law_file import from_file
 from vaneloop.verbs.learn import learn
 
 NAME = "outflow.gain_of_level_and_oil"

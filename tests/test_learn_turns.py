@@ -15,12 +15,12 @@ from tests.test_page import unpack
 from vaneloop import Record, System, unknown
 from vaneloop.base.durations import folded, period_in_name, within_no_period
 from vaneloop.base.tables import read
-from vaneloop.discrepancy import StageError
-from vaneloop.discrepancy.models.curve_file import from_file
-from vaneloop.discrepancy.models.known import quantities
-from vaneloop.discrepancy.models.python_law import python_law
-from vaneloop.discrepancy.models.quantities import every
-from vaneloop.discrepancy.models.turns import periods_along
+from vaneloop.identification import StageError
+from vaneloop.identification.unmodelled.python_law import python_law
+from vaneloop.identification.unmodelled.regressors import quantities
+from vaneloop.identification.unmodelled.spectral_lines import periods_along
+from vaneloop.identification.user_models.exogenous_regressors import every
+from vaneloop.identification.user_models.law_file import from_file
 from vaneloop.pages.learned import about, curve_figure
 from vaneloop.verbs.learn import learn
 

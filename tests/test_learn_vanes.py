@@ -21,8 +21,8 @@ from tests import rig
 from tests.firmware_on_rig import firmware
 from vaneloop.base.errors import InputError
 from vaneloop.cli.main import main
-from vaneloop.discrepancy.models.vane_stages.ground import VaneGround, remade, reversals
-from vaneloop.discrepancy.models.vanes import Chain, build_chain
+from vaneloop.identification.vane_chain.candidates import VaneGround, remade, reversals
+from vaneloop.identification.vane_chain.chain import Chain, build_chain
 from vaneloop.verbs.learn import learned
 
 N = 3000

@@ -12,9 +12,9 @@ import pytest
 from hil.logs import Channel, Log
 from tests import rig
 from tests.firmware_on_rig import firmware
-from vaneloop.discrepancy.models.vane_stages.raster import SETTLE
-from vaneloop.discrepancy.models.vanes import Chain, build_chain
-from vaneloop.discrepancy.workflow import diagnose
+from vaneloop.identification.vane_chain.chain import Chain, build_chain
+from vaneloop.identification.vane_chain.resample import SETTLE
+from vaneloop.identification.workflow import diagnose
 
 DURATION = 120.0  # s
 FREE_RUNNING = ("demand", "servo", "engine")

@@ -11,11 +11,11 @@ import pytest
 from hil.logs import Channel, Log
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.models.vane_stages.ground import remade
-from vaneloop.discrepancy.models.vane_stages.raster import Grid, grid_of, on_raster
-from vaneloop.discrepancy.whole import BLOCKS, Failing, Sums, failing, joined, of_whole
-from vaneloop.discrepancy.workflow import diagnose
+from vaneloop.identification.chunked_residuals import BLOCKS, Failing, Sums, failing, joined, of_whole
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.vane_chain.candidates import remade
+from vaneloop.identification.vane_chain.resample import Grid, grid_of, on_raster
+from vaneloop.identification.workflow import diagnose
 from vaneloop.verbs import long
 from vaneloop.verbs.machine import Machine
 

@@ -10,15 +10,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.test_discrepancy import FLOOR, GAIN, LIBRARY, NULL_BIAS, T, integrator, wave
+from tests.test_identification import FLOOR, GAIN, LIBRARY, NULL_BIAS, T, integrator, wave
 from tests.test_search_limits import SIDES, verdict
-from vaneloop.discrepancy import Effect, Parameter, Stage
-from vaneloop.discrepancy.diagnose import diagnose_stage
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.locate import shape
-from vaneloop.discrepancy.noise_floor import with_rivals
-from vaneloop.discrepancy.stage_answer import StageDiagnosis
-from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
+from vaneloop.identification import Effect, Parameter, Stage
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.regimes import shape
+from vaneloop.identification.results import StageDiagnosis
+from vaneloop.identification.selection.diagnosis import diagnose_stage
+from vaneloop.identification.selection.likelihood_acceptance import with_rivals
+from vaneloop.identification.workflow import diagnose, diagnosis_json
 
 SMALL = Effect(
     "null_bias", (replace(NULL_BIAS.parameters[0], low=-0.4, high=0.4),), ((-0.1,), (0.1,), (0.3,)), "any motion"

@@ -718,7 +718,7 @@ def test_a_wrong_own_scalar_is_refused(gcc: str, tmp_path: Path, text: str, said
 def test_the_demand_stage_is_the_users_own_firmware(reference: str, gcc: str, tmp_path: Path) -> None:
     """On a log of the firmware, its own copy in C leaves nothing; another controller is found in the demand stage."""
     from vaneloop import Machine, read_log
-    from vaneloop.discrepancy.workflow import locate_stages
+    from vaneloop.identification.workflow import locate_stages
 
     log = read_log(ROOT / "examples" / "hidden_effect.parquet", require=())
     assert main(["new-controller", str(tmp_path / "mine"), "--quiet"]) == 0

@@ -12,13 +12,13 @@ import pytest
 from controller import load_calibration
 from plant import build_plant
 from vaneloop.cli import extend
-from vaneloop.discrepancy.diagnose import extend_stage
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.models.vanes import Chain
-from vaneloop.discrepancy.noise_floor import NoiseFloor
-from vaneloop.discrepancy.search import Search
-from vaneloop.discrepancy.stage import Effect, Parameter, Stage
-from vaneloop.discrepancy.workflow import no_better
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.selection.diagnosis import extend_stage
+from vaneloop.identification.selection.likelihood_acceptance import NoiseFloor
+from vaneloop.identification.selection.search import Search
+from vaneloop.identification.subsystem import Effect, Parameter, Stage
+from vaneloop.identification.vane_chain.chain import Chain
+from vaneloop.identification.workflow import no_better
 from vaneloop.verbs import search as verbs
 
 N = 1200

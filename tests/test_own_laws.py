@@ -17,8 +17,8 @@ from tests.test_your_own_model import STRAIGHT, T, line, named, noise, wave
 from vaneloop import Law, Parameter, Record, System, unknown
 from vaneloop.base.errors import InputError
 from vaneloop.cli.main import main
-from vaneloop.discrepancy.models.dispatch import dispatch_of
-from vaneloop.discrepancy.stage import StageError
+from vaneloop.identification.subsystem import StageError
+from vaneloop.identification.user_models.codegen import dispatch_of
 from vaneloop.verbs.search import compare, diagnose, extend
 
 
@@ -134,7 +134,7 @@ def test_an_own_law_is_found_fitted_kept_in_the_model_file_and_shown(tmp_path: P
     assert "u.worn" in answer.page().html() and answer.to_dict()["effects"][0]["effect"] == "u.worn"
     better = extend([record("a", u)], ["u.worn"], system)
     file = better.write(tmp_path / "better.toml")
-    from vaneloop.discrepancy.models.by_log import load_model_of
+    from vaneloop.identification.user_models.by_log import load_model_of
 
     model = load_model_of(file, system)
     again = diagnose([record("b", v)], system, added=model)

@@ -21,8 +21,8 @@ from hil.figures import error_figures
 from tests.browser import open_to_all
 from tests.conftest import ROOT, examples
 from vaneloop.base.errors import InputError
-from vaneloop.discrepancy.locate import Regime
-from vaneloop.discrepancy.stage_answer import Found, StageDiagnosis
+from vaneloop.identification.regimes import Regime
+from vaneloop.identification.results import Found, StageDiagnosis
 from vaneloop.pages.engine_test import PAPER_TABLE_5, engine_test_report
 from vaneloop.pages.failures import failure_map
 from vaneloop.pages.figures import Line, Panel, bars, heat, histogram, loop, overlay, ranking, waterfall
@@ -468,7 +468,7 @@ def test_a_dual_schedule_that_misses_the_paper_is_not_called_good(tmp_path):
 
 def test_a_stage_that_fails_under_one_condition_only_is_not_said_to_fail_by_what_is_noise() -> None:
     """1.03 noise floors over the whole log are none; the condition is what is told."""
-    from vaneloop.discrepancy.locate import Located, Regime, StageFigures
+    from vaneloop.identification.regimes import Located, Regime, StageFigures
     from vaneloop.pages.diagnosis import located_sentence
 
     whole = StageFigures("engine", "n_r", "%", 1.03, 1.03, 1.0, 8000)
@@ -485,8 +485,8 @@ def test_a_stage_that_fails_under_one_condition_only_is_not_said_to_fail_by_what
 
 def test_a_stage_of_which_the_log_says_nothing_is_never_said_to_fit() -> None:
     """A log without a stroke tells nothing of servo and actuator: the sentence says so."""
-    from vaneloop.discrepancy.locate import Located, StageFigures
-    from vaneloop.discrepancy.workflow import Diagnosis
+    from vaneloop.identification.regimes import Located, StageFigures
+    from vaneloop.identification.workflow import Diagnosis
     from vaneloop.pages.diagnosis import located_sentence, verdict_sentence
 
     fine, bad = (
@@ -527,7 +527,7 @@ def test_every_cell_of_a_map_has_its_words_and_an_empty_one_none() -> None:
 
 def test_what_is_called_worst_is_the_worst_cell_of_the_map() -> None:
     """The most telling condition is not always the one with the greatest error."""
-    from vaneloop.discrepancy.locate import Regime
+    from vaneloop.identification.regimes import Regime
     from vaneloop.pages.failures import failure_map, worst_cell
 
     def regime(name: str, ratio: list[float], samples: list[int]) -> Regime:

@@ -29,16 +29,16 @@ from vaneloop.design.measured_loop import MeasuredLoop
 from vaneloop.design.scheduling import ScheduleResult
 from vaneloop.design.spatial import SpatialCheck
 from vaneloop.design.strategies import Failure, Outcome, Scenario
-from vaneloop.discrepancy.fit import Fit, Judge
-from vaneloop.discrepancy.formulas import Formula
-from vaneloop.discrepancy.locate import Shape, locate
-from vaneloop.discrepancy.models.by_log import ByLog, Logs
-from vaneloop.discrepancy.models.learned import LearnedLaw
-from vaneloop.discrepancy.models.learned_surface import LearnedSurface
-from vaneloop.discrepancy.models.tried import Outcome as Learning
-from vaneloop.discrepancy.stage import Effect, Parameter, Stage
-from vaneloop.discrepancy.stage_answer import Candidate, Found, StageDiagnosis
-from vaneloop.discrepancy.workflow import Diagnosis
+from vaneloop.identification.candidates.closed_forms import Formula
+from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.regimes import Shape, locate
+from vaneloop.identification.results import Candidate, Found, StageDiagnosis
+from vaneloop.identification.subsystem import Effect, Parameter, Stage
+from vaneloop.identification.unmodelled.fitted_candidate import Outcome as Learning
+from vaneloop.identification.unmodelled.learned_law import LearnedLaw
+from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
+from vaneloop.identification.user_models.by_log import ByLog, Logs
+from vaneloop.identification.workflow import Diagnosis
 from vaneloop.pages.by_log import curves_by_log, log_by_log
 from vaneloop.pages.campaign import CampaignView, GroupView, Requirement, campaign_page
 from vaneloop.pages.design import design_page

@@ -20,9 +20,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from hil.figures import SignalError
 from tests.conftest import examples
 from tests.page_outline import unpacked
-from vaneloop.discrepancy.locate import Located, Regime, StageFigures
-from vaneloop.discrepancy.stage_answer import Found, StageDiagnosis
-from vaneloop.discrepancy.workflow import Diagnosis
+from vaneloop.identification.regimes import Located, Regime, StageFigures
+from vaneloop.identification.results import Found, StageDiagnosis
+from vaneloop.identification.workflow import Diagnosis
 from vaneloop.pages import page as page_module
 from vaneloop.pages.by_log import short_names
 from vaneloop.pages.diagnosis import located_sentence, located_tone, verdict_sentence

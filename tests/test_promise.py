@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from vaneloop import Record, System, unknown
-from vaneloop.discrepancy.error_share import ErrorShare
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.laws import STICTION, apply
-from vaneloop.discrepancy.models.motion import low_pass
-from vaneloop.discrepancy.models.stairs import steps_seen
-from vaneloop.discrepancy.promise import Slopes, _solved, along, followed, out_of, within
-from vaneloop.discrepancy.search import Search
-from vaneloop.discrepancy.stage import Effect, Parameter, Stage
+from vaneloop.identification.candidates.laws import STICTION, apply
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.selection.relative_error_acceptance import ErrorShare
+from vaneloop.identification.selection.screening import Slopes, _solved, along, followed, out_of, within
+from vaneloop.identification.selection.search import Search
+from vaneloop.identification.subsystem import Effect, Parameter, Stage
+from vaneloop.identification.user_models.bound_system import steps_seen
+from vaneloop.identification.user_models.motion import low_pass
 
 N = 600
 T = np.arange(N) * 0.1

@@ -12,10 +12,10 @@ import pytest
 from hil.logs import Channel, Log
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
-from vaneloop.discrepancy.diagnose import diagnose_stage
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.models.vanes import Chain, build_chain
-from vaneloop.discrepancy.stage_answer import StageDiagnosis, rms_per_output
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.results import StageDiagnosis, rms_per_output
+from vaneloop.identification.selection.diagnosis import diagnose_stage
+from vaneloop.identification.vane_chain.chain import Chain, build_chain
 
 
 def recorded(hidden: list[Hidden], seed: int, rate: int, duration: float = 120.0) -> dict[str, np.ndarray]:
@@ -125,8 +125,8 @@ def test_a_valve_with_hysteresis_is_found_though_it_turns_between_the_rows() -> 
 
 def test_many_effects_that_leave_much_are_an_imitation() -> None:
     """Three effects that bring an error from 6 to 2 floors: enough of it for one effect, not for three."""
-    from vaneloop.discrepancy.fit import Judge
-    from vaneloop.discrepancy.noise_floor import NoiseFloor
+    from vaneloop.identification.least_squares.problem import Judge
+    from vaneloop.identification.selection.likelihood_acceptance import NoiseFloor
 
     stage = chain_of(recorded([], 37, 100, 60.0)).stage("engine")
     assert stage.floor is not None

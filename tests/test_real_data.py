@@ -16,8 +16,8 @@ import pytest
 
 import vaneloop
 from vaneloop.cli.main import main
-from vaneloop.discrepancy import System, unknown
-from vaneloop.discrepancy.models.by_log import bind
+from vaneloop.identification import System, unknown
+from vaneloop.identification.user_models.by_log import bind
 from vaneloop.verbs.search import Diagnosed, read_record
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -6,9 +6,9 @@ import pytest
 
 from tests.rig import Hidden
 from tests.test_readings import chain_of, recorded
-from vaneloop.discrepancy.diagnose import diagnose_stage
-from vaneloop.discrepancy.stage_answer import StageDiagnosis
-from vaneloop.discrepancy.workflow import diagnose
+from vaneloop.identification.results import StageDiagnosis
+from vaneloop.identification.selection.diagnosis import diagnose_stage
+from vaneloop.identification.workflow import diagnose
 
 
 def said(hidden: list[Hidden], seed: int, stage: str) -> StageDiagnosis:

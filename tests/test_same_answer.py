@@ -22,12 +22,13 @@ from tests.conftest import ROOT
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
 from vaneloop.cli.main import main
-from vaneloop.discrepancy import locate as core
-from vaneloop.discrepancy.diagnose import diagnose_stage, extend_stage
-from vaneloop.discrepancy.models.vane_stages import current, stroke
-from vaneloop.discrepancy.models.vane_stages.raster import rms
-from vaneloop.discrepancy.models.vanes import Chain, _lost_bits, _lost_step, build_chain
-from vaneloop.discrepancy.workflow import compare_stages, locate_stages
+from vaneloop.identification import regimes as core
+from vaneloop.identification.selection.diagnosis import diagnose_stage, extend_stage
+from vaneloop.identification.vane_chain import current
+from vaneloop.identification.vane_chain import current as stroke
+from vaneloop.identification.vane_chain.chain import Chain, _lost_bits, _lost_step, build_chain
+from vaneloop.identification.vane_chain.resample import rms
+from vaneloop.identification.workflow import compare_stages, locate_stages
 
 LOG = ROOT / "examples" / "hidden_effect.parquet"
 SENSOR = {

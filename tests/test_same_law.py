@@ -9,7 +9,7 @@ import pytest
 
 from vaneloop import Record, System, unknown
 from vaneloop.cli.same_law import same_by_equations
-from vaneloop.discrepancy.formulas import Formula
+from vaneloop.identification.candidates.closed_forms import Formula
 
 VALVE = System(
     "valve", "static", lambda u, p: p.gain * u.current + p.offset, inputs={"current": "mA"}, outputs={"flow": "l/min"},

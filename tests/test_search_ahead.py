@@ -8,22 +8,35 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from tests.test_discrepancy import FLOOR, GAUGE_FLOOR, TRUTH, U, V, W, gauges, holds, integrator, linear, names, search
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.noise_floor import NoiseFloor
-from vaneloop.discrepancy.promise import _best_within
-from vaneloop.discrepancy.scout import Scouted, searched
-from vaneloop.discrepancy.search import Search
-from vaneloop.discrepancy.stage import Stage
-from vaneloop.discrepancy.stage_answer import StageDiagnosis
+from tests.test_identification import (
+    FLOOR,
+    GAUGE_FLOOR,
+    TRUTH,
+    U,
+    V,
+    W,
+    gauges,
+    holds,
+    integrator,
+    linear,
+    names,
+    search,
+)
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.results import StageDiagnosis
+from vaneloop.identification.selection.likelihood_acceptance import NoiseFloor
+from vaneloop.identification.selection.screening import _best_within
+from vaneloop.identification.selection.search import Search
+from vaneloop.identification.selection.subsampled_search import Scouted, searched
+from vaneloop.identification.subsystem import Stage
 
 AHEAD = 3_000  # samples of the excerpt
 
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vaneloop.discrepancy.scout.AHEAD", AHEAD)
-    monkeypatch.setattr("vaneloop.discrepancy.scout.PIECE", 300)
+    monkeypatch.setattr("vaneloop.identification.selection.subsampled_search.AHEAD", AHEAD)
+    monkeypatch.setattr("vaneloop.identification.selection.subsampled_search.PIECE", 300)
 
 
 def with_excerpts(stage: Stage, sets: dict[int, int] | None = None) -> Stage:

@@ -18,11 +18,16 @@ import pytest
 from scipy.stats import norm
 
 from tests.conftest import ROOT
-from vaneloop.discrepancy import diagnose, fit, locate, noise_floor, stage_answer, workflow
-from vaneloop.discrepancy.fit import Fit, Judge
-from vaneloop.discrepancy.noise_floor import NoiseFloor
-from vaneloop.discrepancy.search import Search
-from vaneloop.discrepancy.stage import Effect, Parameter, Stage
+from vaneloop.identification import regimes as locate
+from vaneloop.identification import results as stage_answer
+from vaneloop.identification import workflow
+from vaneloop.identification.least_squares import problem as fit
+from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.selection import diagnosis as diagnose
+from vaneloop.identification.selection import likelihood_acceptance as noise_floor
+from vaneloop.identification.selection.likelihood_acceptance import NoiseFloor
+from vaneloop.identification.selection.search import Search
+from vaneloop.identification.subsystem import Effect, Parameter, Stage
 
 DOCUMENTED = {
     "NATS": 12.0, "SPREADS": 3.0, "BLOCK_SPREADS": 8.0, "LEAST_SHARE": 0.15, "FLOOR_KNOWN": 0.01, "TOLERATED": 1.05,

@@ -22,7 +22,7 @@ from tests.conftest import ROOT
 from vaneloop.base import terminal
 from vaneloop.base.tables import load_toml, path
 from vaneloop.cli.main import COMMANDS
-from vaneloop.discrepancy.library import LAWS
+from vaneloop.identification.candidates.library import LAWS
 
 pytest.importorskip("mkdocs")
 pytestmark = pytest.mark.slow

@@ -17,8 +17,8 @@ from vaneloop import System, unknown
 from vaneloop.base.errors import InputError
 from vaneloop.base.sizes import LARGEST, SMALLEST, beyond, no_smaller
 from vaneloop.cli.main import main
-from vaneloop.discrepancy.fit import covariance
-from vaneloop.discrepancy.models.system import Record
+from vaneloop.identification.least_squares.problem import covariance
+from vaneloop.identification.user_models.system import Record
 
 T = np.arange(600) * 0.01
 WAVE = np.sin(2.0 * T)

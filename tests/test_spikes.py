@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.conftest import examples
 from tests.test_your_own_model import drained, tank_of
-from vaneloop.discrepancy.models.spikes import LONGEST, spikes
+from vaneloop.identification.user_models.data import LONGEST, spikes
 from vaneloop.verbs.search import diagnose
 
 T = np.arange(0.0, 60.0, 0.05)

@@ -22,15 +22,16 @@ PACKAGES = ("controller", "plant", "hil", "vaneloop")
 OURS = {*PACKAGES, "tests", "benchmarks", "examples"}
 
 # The table of docs/architecture.md: what code in a room may import besides the room itself. The longest path counts.
+MODELS = ("user_models", "unmodelled", "vane_chain")  # of the identification package: what it can look at
 LOWER = {"vaneloop.base", "controller", "plant", "hil"}
-SEARCH = {*LOWER, "vaneloop.discrepancy"}
+SEARCH = {*LOWER, "vaneloop.identification"}
 MAY_IMPORT: dict[str, set[str]] = {
     "controller": {"vaneloop.base"},
     "plant": {"vaneloop.base"},
     "hil": {"vaneloop.base", "controller", "plant"},
     "vaneloop/base": set(),
-    "vaneloop/discrepancy": {"vaneloop.base"},
-    "vaneloop/discrepancy/models": SEARCH,
+    "vaneloop/identification": {"vaneloop.base"},
+    **{f"vaneloop/identification/{models}": SEARCH for models in MODELS},
     "vaneloop/design": SEARCH,
     "vaneloop/pages": {*SEARCH, "vaneloop.design"},
     "vaneloop/verbs": {*SEARCH, "vaneloop.pages"},
@@ -46,7 +47,10 @@ DOORS: dict[str, tuple[str, ...]] = {
     "hil/replay.py": ("vaneloop.cli.replay",),  # python -m hil.replay
     "hil/inject/__main__.py": ("vaneloop.cli.inject",),  # python -m hil.inject
     # what a user describes is offered at the room's door
-    "vaneloop/discrepancy/__init__.py": ("vaneloop.discrepancy.models.load", "vaneloop.discrepancy.models.system"),
+    "vaneloop/identification/__init__.py": (
+        "vaneloop.identification.user_models.load",
+        "vaneloop.identification.user_models.system",
+    ),
     # the blind benchmarks hide effects and laws with simulators of the checkout, and say so where there is none
     "vaneloop/cli/blind.py": ("tests",),
 }
@@ -139,7 +143,7 @@ EXPORTS: dict[str, list[str]] = {
         *("experiment", "extend", "learn", "load_system", "locate", "open_bus", "read_log", "replay", "unknown"),
         "write_log",
     ],
-    "vaneloop.discrepancy": [
+    "vaneloop.identification": [
         "Effect",
         "Parameter",
         "Record",
@@ -201,7 +205,7 @@ def may_import(file: str, name: str) -> bool:
         return True
     if home == "tests/rig":
         return name == "tests" or within(name, "tests.rig")
-    if home == "vaneloop/discrepancy" and within(name, "vaneloop.discrepancy.models"):
+    if home == "vaneloop/identification" and any(within(name, f"vaneloop.identification.{m}") for m in MODELS):
         return False  # the core would know the vane chain through them
     if name in ("vaneloop", "hil") or (name == "vaneloop.cli" and file in DOORS):
         return True  # `from vaneloop import x` also gives vaneloop.x, which is judged by itself
@@ -249,30 +253,38 @@ def test_imports_run_the_way_the_architecture_says(home: str) -> None:
         ("controller/x.py", "def f():\n    from plant.effects import play", "plant.effects"),
         ("controller/x.py", "import time", "time"),
         ("controller/x.py", "from vaneloop.base.tables import read", None),
-        ("controller/x.py", "from vaneloop.discrepancy import System", "vaneloop.discrepancy"),
+        ("controller/x.py", "from vaneloop.identification import System", "vaneloop.identification"),
         ("plant/effects/x.py", "from .. import controller", None),  # plant.controller, which is plant's own
         ("plant/x.py", "import importlib\nimportlib.import_module('hil.runner')", "hil.runner"),
         ("plant/x.py", "m = __import__('controller')", "controller"),
-        ("hil/x.py", "import vaneloop.discrepancy.fit as d", "vaneloop.discrepancy.fit"),
+        (
+            "hil/x.py",
+            "import vaneloop.identification.least_squares.problem as d",
+            "vaneloop.identification.least_squares.problem",
+        ),
         ("hil/x.py", "from plant import chain\nfrom controller import tick", None),
         ("hil/x.py", "if True:\n    import tests.rig", "tests.rig"),
         ("hil/logs/x.py", "from vaneloop.cli import replay", "vaneloop.cli"),
         ("hil/replay.py", "from vaneloop.cli import replay", None),
         ("hil/replay.py", "from vaneloop.cli import compare", "vaneloop.cli.compare"),
-        ("vaneloop/discrepancy/locate.py", "import hil.logs", "hil.logs"),
-        ("vaneloop/discrepancy/locate.py", "from vaneloop.base.errors import InputError", None),
+        ("vaneloop/identification/regimes.py", "import hil.logs", "hil.logs"),
+        ("vaneloop/identification/regimes.py", "from vaneloop.base.errors import InputError", None),
         (
-            "vaneloop/discrepancy/locate.py",
-            "from vaneloop.discrepancy.models import vanes",
-            "vaneloop.discrepancy.models",
+            "vaneloop/identification/regimes.py",
+            "from vaneloop.identification.vane_chain import chain",
+            "vaneloop.identification.vane_chain",
         ),
-        ("vaneloop/discrepancy/laws/x.py", "from ..models.vanes import chain", "vaneloop.discrepancy.models.vanes"),
         (
-            "vaneloop/discrepancy/models/vanes.py",
-            "import plant, controller, hil\nfrom vaneloop.discrepancy import fit",
+            "vaneloop/identification/candidates/x.py",
+            "from ..vane_chain.chain import chain",
+            "vaneloop.identification.vane_chain.chain",
+        ),
+        (
+            "vaneloop/identification/vane_chain/chain.py",
+            "import plant, controller, hil\nfrom vaneloop.identification import workflow",
             None,
         ),
-        ("vaneloop/discrepancy/models/vanes.py", "from vaneloop.pages import page", "vaneloop.pages"),
+        ("vaneloop/identification/vane_chain/chain.py", "from vaneloop.pages import page", "vaneloop.pages"),
         ("vaneloop/design/x.py", "from vaneloop.pages.page import Page", "vaneloop.pages.page"),
         ("vaneloop/pages/x.py", "from vaneloop.design import servo", None),
         ("vaneloop/pages/x.py", "from vaneloop.base import terminal\nfrom vaneloop.cli import main", "vaneloop.cli"),
@@ -447,7 +459,7 @@ def test_what_holds_arrays_is_compared_by_identity() -> None:
     """``==`` of two such records, and ``in`` a list of them, would ask arrays whether they are true."""
     fields: dict[str, list[str]] = {}
     identity: dict[str, bool] = {}
-    for path in sorted((ROOT / "vaneloop" / "discrepancy").rglob("*.py")):
+    for path in sorted((ROOT / "vaneloop" / "identification").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             how = [ast.unparse(d) for d in getattr(node, "decorator_list", ()) if "dataclass" in ast.unparse(d)]
             if isinstance(node, ast.ClassDef) and how:

@@ -17,8 +17,8 @@ from tests.conftest import examples
 from tests.firmware_on_rig import firmware
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
-from vaneloop.discrepancy.models.vanes import build_chain
-from vaneloop.discrepancy.workflow import diagnose
+from vaneloop.identification.vane_chain.chain import build_chain
+from vaneloop.identification.workflow import diagnose
 
 STROKE = np.linspace(0.0, 48e-3, 49)  # m
 STAGES = VANES[:3]

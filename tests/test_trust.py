@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.trust import Name, fitted, judged, names_of
-from vaneloop.discrepancy import trust as module
-from vaneloop.discrepancy.trust import COEFFICIENTS, trust
+from vaneloop.identification.selection import calibration as module
+from vaneloop.identification.selection.calibration import COEFFICIENTS, trust
 
 LEFT, FALL, SHARE = st.floats(0.5, 1e4), st.floats(0.5, 1e4), st.floats(0.0, 1.0)
 

@@ -17,10 +17,10 @@ from plant import Model, write_model
 from plant.model import Learned as Table
 from vaneloop.base.errors import InputError
 from vaneloop.base.spans import Span
-from vaneloop.discrepancy import Record, StageError, System
-from vaneloop.discrepancy.models.tried import Outcome
-from vaneloop.discrepancy.stage import Effect, Parameter, Stage
-from vaneloop.discrepancy.whole import BLOCKS, Failing, Sums
+from vaneloop.identification import Record, StageError, System
+from vaneloop.identification.chunked_residuals import BLOCKS, Failing, Sums
+from vaneloop.identification.subsystem import Effect, Parameter, Stage
+from vaneloop.identification.unmodelled.fitted_candidate import Outcome
 from vaneloop.verbs import learn, long, parts, search
 from vaneloop.verbs import replay as replay_verb
 from vaneloop.verbs.long import Held, Whole
@@ -449,7 +449,7 @@ def test_tables_come_from_the_folder_where_it_has_them(tmp_path: Path) -> None:
 def test_a_log_of_more_than_an_hour_is_fitted_on_an_excerpt(
     rows: int, excerpt: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vaneloop.discrepancy.models.vane_stages.raster.grid_of", lambda log: Grid(rows=rows))
+    monkeypatch.setattr("vaneloop.identification.vane_chain.resample.grid_of", lambda log: Grid(rows=rows))
     monkeypatch.setattr(long, "excerpted", lambda log, grid, machine: "excerpt")
     monkeypatch.setattr(Machine, "stages_of", lambda self, log, grid: "all")
     log: Any = None
@@ -581,8 +581,10 @@ def test_without_a_curve_the_others_are_fitted_from_where_they_are() -> None:
 
 def test_which_stages_are_asked_for_laws(monkeypatch: pytest.MonkeyPatch) -> None:
     noisy: list[bool] = []
-    monkeypatch.setattr("vaneloop.discrepancy.models.at_the_noise.above_the_noise", lambda judge, base: noisy[-1])
-    monkeypatch.setattr("vaneloop.discrepancy.fit.Judge", lambda stage, floor: None)
+    monkeypatch.setattr(
+        "vaneloop.identification.unmodelled.likelihood_acceptance.above_the_noise", lambda judge, base: noisy[-1]
+    )
+    monkeypatch.setattr("vaneloop.identification.least_squares.problem.Judge", lambda stage, floor: None)
     for made, verdict, above, asked in (
         ("x", "missing", True, False), ("x", "unknown", False, True), ("x", "none", True, True),
         ("x", "none", False, False), (None, "unknown", True, False),
@@ -610,7 +612,7 @@ class Learning:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **stages: tuple[str, Says | None]):
         self.told: list[float] = []
         self.asked: list[Any] = []
-        models = "vaneloop.discrepancy.models"
+        unmodelled = "vaneloop.identification.unmodelled"
         says = {name: said for name, (_, said) in stages.items()}
 
         def learner(ground: Any, d: Any, tell: Any, shape: Any, formulas: bool) -> Any:
@@ -619,10 +621,16 @@ class Learning:
             return SimpleNamespace(learned=lambda: says[d.stage], judge="judge", base="base")
 
         monkeypatch.setattr(learn, "_open", lambda chain, d: d.verdict != "missing")
-        monkeypatch.setattr(f"{models}.learning.Learner", learner)
-        monkeypatch.setattr(f"{models}.vane_stages.ground.VaneGround", lambda stage, floor, test: (stage.name, test))
-        monkeypatch.setattr(f"{models}.learned.law_of", lambda ground, before, tried: law(tried.name, before=before))
-        monkeypatch.setattr(f"{models}.spoken.spoken", lambda learner, tried, own: (tried[-1], own))
+        monkeypatch.setattr(f"{unmodelled}.learning.Learner", learner)
+        monkeypatch.setattr(
+            "vaneloop.identification.vane_chain.candidates.VaneGround", lambda stage, floor, test: (stage.name, test)
+        )
+        monkeypatch.setattr(
+            f"{unmodelled}.learned_law.law_of", lambda ground, before, tried: law(tried.name, before=before)
+        )
+        monkeypatch.setattr(
+            f"{unmodelled}.parametric_substitution.spoken", lambda learner, tried, own: (tried[-1], own)
+        )
         monkeypatch.setattr(learn, "_as_model", lambda model, kept, laws, last: model.noted(f"{len(kept.tried)} laws"))
         monkeypatch.setattr(learn, "_with_stage", lambda model, judge, fit: model.noted(f"stage of {judge}"))
         monkeypatch.setattr(learn, "with_fits", lambda model, stages: model.noted(f"fits of {len(stages)}"))
@@ -884,7 +892,9 @@ def test_verbs_tell_a_system_from_a_machine(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(search, "not_given", lambda chain, without: (chain, *without))
     monkeypatch.setattr(search, "diagnosed", lambda *a: ("diagnosed", *a))
     monkeypatch.setattr(search, "compared", lambda *a, progress: ("compared", *a, progress))
-    monkeypatch.setattr("vaneloop.discrepancy.models.experiment.recommend", lambda d, progress, bound: {"text": "go"})
+    monkeypatch.setattr(
+        "vaneloop.identification.vane_chain.experiment.recommend", lambda d, progress, bound: {"text": "go"}
+    )
     machine, tell = Machine(), object()
     said: Any = search.diagnose("a.csv", machine, fit="0:1", without=["x"], progress=tell)  # type: ignore[arg-type]
     assert said == ("diagnosed", ("chain", "x"), "a.csv", 2, tell) and asked == [("chain", "a.csv", machine, "0:1", ())]
@@ -898,7 +908,9 @@ def test_verbs_tell_a_system_from_a_machine(monkeypatch: pytest.MonkeyPatch) -> 
     found = SimpleNamespace(stages=["first", "second"], notes=["old"])
     monkeypatch.setattr(search, "search", lambda *a: asked.append(("search", *a)) or found)
     by_log = SimpleNamespace(notes=["by log"])
-    monkeypatch.setattr("vaneloop.discrepancy.models.by_log.ByLog.of", lambda *a: asked.append(("of", *a)) or by_log)
+    monkeypatch.setattr(
+        "vaneloop.identification.user_models.by_log.ByLog.of", lambda *a: asked.append(("of", *a)) or by_log
+    )
     own = system(without=["a"])
     said = search.diagnose("r.csv", own, without=["b"], progress=tell)  # type: ignore[arg-type]
     (_, log, of, *_), (_, *how), (_, *by) = asked[-3:]
@@ -915,7 +927,7 @@ class Own:
     """Stands for what `learn` calls on a system's logs: what each part was asked, and what it says."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, verdict: str = "learned", errors: Sequence[float] = (2.0, 1.5)):
-        models, answers = "vaneloop.discrepancy.models", "vaneloop.discrepancy.stage_answer"
+        unmodelled, answers = "vaneloop.identification.unmodelled", "vaneloop.identification.results"
         self.asked: dict[str, list[Any]] = {}
         self.told: list[float] = []
         self.judge = SimpleNamespace(
@@ -934,13 +946,16 @@ class Own:
         self.by_log = SimpleNamespace(model=Model(meta={"x": 1}), json=dict)
         self.errors = errors
         for at, said in (
-            (f"{models}.learning.Learner", self.learner), (f"{models}.curved.OwnGround", "ground"),
-            (f"{models}.curved.on_logs", "logs on"), (f"{answers}.rms_of", 4.0), (f"{answers}.found_of", "found"),
-            (f"{answers}.answer_of", self.answer()), (f"{models}.by_log.ByLog.of", self.by_log),
+            (f"{unmodelled}.learning.Learner", self.learner), (f"{unmodelled}.curve_candidates.OwnGround", "ground"),
+            (f"{unmodelled}.curve_candidates.on_logs", "logs on"), (f"{answers}.rms_of", 4.0),
+            (f"{answers}.found_of", "found"), (f"{answers}.answer_of", self.answer()),
+            ("vaneloop.identification.user_models.by_log.ByLog.of", self.by_log),
         ):  # fmt: skip
             monkeypatch.setattr(at, self.note(at.rpartition(".")[2], said))
-        monkeypatch.setattr(f"{models}.learned.law_of", self.law_of)
-        monkeypatch.setattr(f"{models}.spoken.spoken", lambda learner, tried, laws: (tried[0], laws[:1]))
+        monkeypatch.setattr(f"{unmodelled}.learned_law.law_of", self.law_of)
+        monkeypatch.setattr(
+            f"{unmodelled}.parametric_substitution.spoken", lambda learner, tried, laws: (tried[0], laws[:1])
+        )
         monkeypatch.setattr(learn, "_without", lambda judge, fit, names, n: f"without {n}" if len(names) > 1 else None)
         monkeypatch.setattr(learn, "_as_model", self.note("as_model", "the model"))
         logs = SimpleNamespace(fitted=None, test=None)
@@ -1047,9 +1062,13 @@ def test_the_first_law_is_written_as_python(tmp_path: Path, monkeypatch: pytest.
     class Surface(SimpleNamespace):
         pass
 
-    monkeypatch.setattr("vaneloop.discrepancy.models.learned_surface.LearnedSurface", Surface)
-    monkeypatch.setattr("vaneloop.discrepancy.models.python_law.python_law", lambda law, system: f"{law.name} {system}")
-    monkeypatch.setattr("vaneloop.discrepancy.models.python_surface.python_surface", lambda law: f"surface {law.name}")
+    monkeypatch.setattr("vaneloop.identification.unmodelled.learned_surface.LearnedSurface", Surface)
+    monkeypatch.setattr(
+        "vaneloop.identification.unmodelled.python_law.python_law", lambda law, system: f"{law.name} {system}"
+    )
+    monkeypatch.setattr(
+        "vaneloop.identification.unmodelled.python_surface.python_surface", lambda law: f"surface {law.name}"
+    )
     own: Any = "pump"
     laws = [law("one"), law("two")]
     assert answer("learned", laws).write_python(tmp_path / "l.py", own) == tmp_path / "l.py"
@@ -1080,10 +1099,10 @@ class Beside(Own):
         )
         laws = [law("first", error_after=9.0), law("last", error_after=after)] if more.get("found", True) else []
         self.said = learn.Learned(self.of, Outcome("learned", notes=[]), laws, self.with_them, log="x")  # type: ignore[arg-type]
-        models = "vaneloop.discrepancy.models.by_log"
+        models = "vaneloop.identification.user_models.by_log"
         monkeypatch.setattr(f"{models}.bind", lambda *a: self.bound.append(a) or self.again)
         monkeypatch.setattr(f"{models}.as_given", lambda logs, fit: self.given)
-        monkeypatch.setattr("vaneloop.discrepancy.fit.Judge", lambda stage, floor: self.judge)
+        monkeypatch.setattr("vaneloop.identification.least_squares.problem.Judge", lambda stage, floor: self.judge)
         monkeypatch.setattr(learn, "_learned", lambda again, *a: self.bound.append((again, *a)) or self.said)
 
     def beside(self, alone: Any = None) -> Any:
@@ -1141,9 +1160,9 @@ def test_what_was_learned_alone_stands_where_it_does_as_well(monkeypatch: pytest
     def fails(*_: Any) -> Any:
         raise StageError("does not run")
 
-    monkeypatch.setattr("vaneloop.discrepancy.models.by_log.bind", fails)
+    monkeypatch.setattr("vaneloop.identification.user_models.by_log.bind", fails)
     assert Beside(monkeypatch).beside() is not None
-    monkeypatch.setattr("vaneloop.discrepancy.models.by_log.bind", fails)
+    monkeypatch.setattr("vaneloop.identification.user_models.by_log.bind", fails)
     assert at.beside() is None
 
 
@@ -1158,7 +1177,7 @@ def extending(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(search, "as_compared", lambda stage, answer: answer)
     monkeypatch.setattr(search, "no_better", lambda answer: "no better" if answer.stage == "linkage" else None)
     monkeypatch.setattr(search, "changed", lambda chain, change: change(chain))
-    ground = "vaneloop.discrepancy.models.vane_stages.ground"
+    ground = "vaneloop.identification.vane_chain.candidates"
     monkeypatch.setattr(f"{ground}.with_laws", lambda stage, names, curves, log: SimpleNamespace(
         name=stage.name, given=(tuple(names), tuple(curves), log)))  # fmt: skip
     monkeypatch.setattr(f"{ground}.curve_effect", lambda name, law: (name, law.values))
@@ -1220,7 +1239,7 @@ def test_laws_of_a_system_are_those_that_it_can_be_given(monkeypatch: pytest.Mon
     answer_ = SimpleNamespace(stage="a")
     by_log = SimpleNamespace(model="by model", notes=["by log"])
     monkeypatch.setattr(search, "extend_stage", lambda *a, **how: asked.append((a, how)) or answer_)
-    monkeypatch.setattr("vaneloop.discrepancy.models.by_log.ByLog.of", lambda *a: asked.append(a) or by_log)
+    monkeypatch.setattr("vaneloop.identification.user_models.by_log.ByLog.of", lambda *a: asked.append(a) or by_log)
     effects = (SimpleNamespace(name="force.spring"), SimpleNamespace(name="force.friction"))
     bound = SimpleNamespace(stage=SimpleNamespace(effects=effects), present={"force.damper"}, thinned="thin",
                             system=SimpleNamespace(name="pump"))  # fmt: skip
@@ -1240,7 +1259,7 @@ def test_of_a_surface_what_goes_on_is_its_range(monkeypatch: pytest.MonkeyPatch)
     class Surface(SimpleNamespace):
         pass
 
-    monkeypatch.setattr("vaneloop.discrepancy.models.learned_surface.LearnedSurface", Surface)
+    monkeypatch.setattr("vaneloop.identification.unmodelled.learned_surface.LearnedSurface", Surface)
     second = {"of": "t_oil", "low": 10.0, "high": 20.0, "form": "line"}
     formula = SimpleNamespace(form="line", numbers={"a": 3.0})
     made = Surface(**vars(law("s", spoken=formula, axis=lambda: second)))
@@ -1285,7 +1304,7 @@ def test_stages_are_compared_and_told_in_a_sentence(monkeypatch: pytest.MonkeyPa
 
 def test_effects_are_left_out_of_every_stage(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "vaneloop.discrepancy.models.vane_stages.ground.without_laws", lambda stages, effects: (stages, effects)
+        "vaneloop.identification.vane_chain.candidates.without_laws", lambda stages, effects: (stages, effects)
     )
     monkeypatch.setattr(search, "changed", lambda chain, change: change(chain))
     chain: Any = Stages([], stages="stages")

@@ -17,10 +17,10 @@ from scipy.interpolate import CubicSpline
 from tests.browser import open_to_all
 from vaneloop.base.spline_rates import SplineRates
 from vaneloop.cli.main import main
-from vaneloop.discrepancy import Parameter, Record, StageError, System, load_system, unknown
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.models.curved import candidates
-from vaneloop.discrepancy.models.data import Data
+from vaneloop.identification import Parameter, Record, StageError, System, load_system, unknown
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.unmodelled.curve_candidates import candidates
+from vaneloop.identification.user_models.data import Data
 from vaneloop.verbs.search import Diagnosed, diagnose, extend, locate
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "your_own_model.md"
@@ -229,7 +229,18 @@ def test_a_log_without_excitation_names_nothing() -> None:
     assert named(diagnose([log], STRAIGHT)) == []
 
 
-BASE = """from discrepancy import Parameter, System, unknown
+@pytest.mark.parametrize("former", ["discrepancy", "vaneloop.discrepancy"])
+def test_a_model_file_may_say_a_former_name_for_one_version_and_is_told(former: str, tmp_path: Path) -> None:
+    file = tmp_path / "tank.py"
+    file.write_text(BASE.replace("vaneloop", former).format(body=RIGHT, parameters=GOOD))
+    with pytest.warns(FutureWarning, match=f"{former}.System is now vaneloop.identification.System"):
+        assert load_system(file).name == "tank"
+    file.write_text(f"from {former} import System, nothing\n")
+    with pytest.raises(StageError, match="nothing"), pytest.warns(FutureWarning):
+        load_system(file)
+
+
+BASE = """from vaneloop import Parameter, System, unknown
 
 def derivative(x, u, p):
     return {body}

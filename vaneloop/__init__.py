@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from hil.inject.scenario import Scenario
     from hil.logs import Channel, Log, read_log, write_log
     from vaneloop.base.errors import InputError
-    from vaneloop.discrepancy.models.load import load_system
-    from vaneloop.discrepancy.models.own_laws import Law
-    from vaneloop.discrepancy.models.system import Record, System, unknown
-    from vaneloop.discrepancy.stage import Parameter
+    from vaneloop.identification.subsystem import Parameter
+    from vaneloop.identification.user_models.load import load_system
+    from vaneloop.identification.user_models.system import Record, System, unknown
+    from vaneloop.identification.user_models.user_laws import Law
     from vaneloop.verbs.learn import learn
     from vaneloop.verbs.machine import Machine
     from vaneloop.verbs.replay import replay
@@ -35,24 +35,24 @@ if TYPE_CHECKING:
 _HOME = {
     "Channel": "hil.logs",
     "InputError": "vaneloop.base.errors",
-    "Law": "vaneloop.discrepancy.models.own_laws",
+    "Law": "vaneloop.identification.user_models.user_laws",
     "Log": "hil.logs",
     "Machine": "vaneloop.verbs.machine",
-    "Parameter": "vaneloop.discrepancy.stage",
-    "Record": "vaneloop.discrepancy.models.system",
+    "Parameter": "vaneloop.identification.subsystem",
+    "Record": "vaneloop.identification.user_models.system",
     "Scenario": "hil.inject.scenario",
-    "System": "vaneloop.discrepancy.models.system",
+    "System": "vaneloop.identification.user_models.system",
     "compare": "vaneloop.verbs.search",
     "diagnose": "vaneloop.verbs.search",
     "experiment": "vaneloop.verbs.search",
     "extend": "vaneloop.verbs.search",
     "learn": "vaneloop.verbs.learn",
-    "load_system": "vaneloop.discrepancy.models.load",
+    "load_system": "vaneloop.identification.user_models.load",
     "locate": "vaneloop.verbs.search",
     "open_bus": "hil.bus.port",
     "read_log": "hil.logs",
     "replay": "vaneloop.verbs.replay",
-    "unknown": "vaneloop.discrepancy.models.system",
+    "unknown": "vaneloop.identification.user_models.system",
     "write_log": "hil.logs",
 }
 

@@ -24,7 +24,7 @@ from vaneloop.base import terminal
 from vaneloop.base.signals import UNITS
 from vaneloop.base.tables import Bound, load_toml, path
 from vaneloop.cli.main import COMMANDS
-from vaneloop.discrepancy.library import LAWS, Size
+from vaneloop.identification.candidates.library import LAWS, Size
 
 __all__ = ["pages"]
 

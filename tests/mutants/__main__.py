@@ -54,13 +54,13 @@ TARGETS: tuple[Target, ...] = (
     Target(
         "search",
         (
-            "vaneloop/discrepancy/descent.py",
-            "vaneloop/discrepancy/diagnose.py",
-            "vaneloop/discrepancy/fit.py",
-            "vaneloop/discrepancy/noise_floor.py",
-            "vaneloop/discrepancy/search.py",
-            "vaneloop/discrepancy/workflow.py",
-            "vaneloop/discrepancy/locate.py",
+            "vaneloop/identification/least_squares/levenberg_marquardt.py",
+            "vaneloop/identification/selection/diagnosis.py",
+            "vaneloop/identification/least_squares/problem.py",
+            "vaneloop/identification/selection/likelihood_acceptance.py",
+            "vaneloop/identification/selection/search.py",
+            "vaneloop/identification/workflow.py",
+            "vaneloop/identification/regimes.py",
         ),
         (
             "tests/test_search_limits.py",
@@ -73,6 +73,11 @@ TARGETS: tuple[Target, ...] = (
         enough=STRICT,
     ),
 )
+CORE = (
+    "vaneloop.identification",
+    *(f"vaneloop.identification.{p}" for p in ("candidates", "least_squares", "selection")),
+)
+OWN_MODELS = ("vaneloop.identification.user_models", "vaneloop.identification.unmodelled")
 # Of each package the files of tests that are nearest to it, where its code runs as it does for a user: compiled.
 NEAREST = {
     "controller": "records_spec controller xcp tables c_reference node",
@@ -95,22 +100,24 @@ NEAREST = {
     "hil.inject": "inject fuzz campaign loop moments inject_spec fuzz_spec",
     "vaneloop": "verbs",
     "vaneloop.base": (
-        "base_spec files streams lean tables kept parts held machines discrepancy learn_surfaces learn_turns "
+        "base_spec files streams lean tables kept parts held machines identification learn_surfaces learn_turns "
         "learn_stops exit_codes your_own_model verbs help curve_lanes"
     ),
-    "vaneloop.discrepancy": (
-        "discrepancy trust latest laws names search_limits search_ahead promise directions rivals curves "
-        "readings held long_logs doubts learn_slopes same_answer"
+    **dict.fromkeys(
+        CORE,
+        "identification trust latest laws names search_limits search_ahead promise directions rivals curves "
+        "readings held long_logs doubts learn_slopes same_answer",
     ),
-    "vaneloop.discrepancy.models": (
+    **dict.fromkeys(
+        OWN_MODELS,
         "laws own_laws hidden_law learn learn_beside learn_confirmed learn_creep learn_differences "
         "learn_faint learn_followers learn_lags learn_periods learn_screening learn_slopes learn_speed "
         "learn_stops learn_surfaces learn_turns learn_two learn_vanes promise spikes starts your_own_model "
-        "kept held"
+        "kept held",
     ),
-    "vaneloop.discrepancy.models.vane_stages": (
+    "vaneloop.identification.vane_chain": (
         "same_answer learn_vanes learn_lags learn_stops learn_followers learn_faint learn_screening held "
-        "loggers long_logs discrepancy curves directions electromechanical readings"
+        "loggers long_logs identification curves directions electromechanical readings"
     ),
     "vaneloop.design": "design_spec schedule_spec design schedule spatial strategies tables tolerances",
     "vaneloop.fleet": "fleet_folder fleet_trends fleet_workers campaign_numbers fleet_report fleet_run campaign",
@@ -129,7 +136,7 @@ NEAREST = {
     ),
     "vaneloop.web": "web moments",
 }
-STRICTLY = ("controller", "hil.bus", "hil.calibrate", "hil.uds", "vaneloop.discrepancy")
+STRICTLY = ("controller", "hil.bus", "hil.calibrate", "hil.uds", *CORE)
 TARGETS += tuple(
     Target(
         package,
@@ -147,9 +154,9 @@ KERNELS = {
     "hil.loop": "loop_spec loop lanes lockstep node moments",
     "vaneloop.base": "tables learn_surfaces learn_stops your_own_model",
     "vaneloop.design": "design_spec schedule_spec design schedule",
-    "vaneloop.discrepancy": "laws discrepancy names search_limits promise trust",
-    "vaneloop.discrepancy.models": "laws learn hidden_law",
-    "vaneloop.discrepancy.models.vane_stages": "same_answer learn_vanes",
+    **dict.fromkeys(CORE, "laws identification names search_limits promise trust"),
+    **dict.fromkeys(OWN_MODELS, "laws learn hidden_law"),
+    "vaneloop.identification.vane_chain": "same_answer learn_vanes",
 }
 TARGETS += tuple(
     Target(

@@ -35,7 +35,7 @@ from vaneloop.base import terminal
 __all__ = ["AHEAD", "Waiting", "digest_of", "is_kept", "keep", "kept_njit", "sources_digest"]
 
 _ROOT = Path(__file__).parents[2]
-_PACKAGES = ("controller", "plant", "hil", "vaneloop/base", "vaneloop/design", "vaneloop/discrepancy")
+_PACKAGES = ("controller", "plant", "hil", "vaneloop/base", "vaneloop/design", "vaneloop/identification")
 # What was compiled when the program was set up (`vaneloop.cli.ahead`), for each Python; here it is only read.
 AHEAD = Path(os.environ.get("VANELOOP_AHEAD") or Path(__file__).parent / "ahead" / str(sys.implementation.cache_tag))
 ENTERED, INNER = ".nbc", ".nbi"  # files of code that Python can call, and of code that only compiled code can

@@ -162,8 +162,8 @@ def _known_machine(args: argparse.Namespace) -> None:
     if not args.system:
         options.machine_of(args)
         return
-    from vaneloop.discrepancy import StageError, load_system
-    from vaneloop.discrepancy.models.by_log import load_model_of
+    from vaneloop.identification import StageError, load_system
+    from vaneloop.identification.user_models.by_log import load_model_of
 
     for name in ("tables", "plant", "controller"):
         if getattr(args, name):

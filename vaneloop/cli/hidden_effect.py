@@ -278,8 +278,8 @@ def _experiment(d: Any, chain: Any, case: dict[str, Any], test: Any, stages_of: 
 
     import numpy as np
 
-    from vaneloop.discrepancy.models.experiment import recommend
-    from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
+    from vaneloop.identification.vane_chain.experiment import recommend
+    from vaneloop.identification.workflow import diagnose, diagnosis_json
 
     e = recommend(d, chain=chain)
     if e is None:
@@ -311,9 +311,9 @@ def judge_case(
 
     from hil.logs import Channel, read_log, write_log
     from plant import build_plant
-    from vaneloop.discrepancy.fit import Judge
-    from vaneloop.discrepancy.models.vanes import build_chain
-    from vaneloop.discrepancy.workflow import diagnose, diagnosis_json
+    from vaneloop.identification.least_squares.problem import Judge
+    from vaneloop.identification.vane_chain.chain import build_chain
+    from vaneloop.identification.workflow import diagnose, diagnosis_json
     from vaneloop.verbs.search import not_given
 
     rig, on_rig, _ = _rig()
@@ -402,7 +402,7 @@ def _too_easy(effect: dict[str, Any]) -> bool:
     """
     from plant import build_plant
     from plant.effects import EFFECTS
-    from vaneloop.discrepancy.models.vane_stages.declared import SHAPES
+    from vaneloop.identification.vane_chain.parameters import SHAPES
 
     if effect["probability"] < LIKELY and not effect["rivals"]:
         return True

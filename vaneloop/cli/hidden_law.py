@@ -149,7 +149,7 @@ def judge_case(
     """
     import logging
 
-    from vaneloop.discrepancy import Record
+    from vaneloop.identification import Record
 
     logging.getLogger("numba").setLevel(logging.ERROR)
     rig, nominal, changes, left_out, surfaces = _systems()

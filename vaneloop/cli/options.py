@@ -105,7 +105,7 @@ def say_tested(args: argparse.Namespace, rows: Any) -> None:
 
 
 def say_located(args: argparse.Namespace, located: Any, most: int = 4) -> None:
-    """Print where a stage (`vaneloop.discrepancy.locate.Located`) fails, under ``most`` conditions at most."""
+    """Print where a stage (`identification.regimes.Located`) fails, under ``most`` conditions at most."""
     terminal.say(args, f"{located.stage}: {located.verdict()}")
     if located.onset is not None:
         terminal.say(args, f"  begins at t = {located.onset:.0f} s")

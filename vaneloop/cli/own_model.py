@@ -61,7 +61,7 @@ def asked(args: argparse.Namespace) -> bool:
 
 def system_of(args: argparse.Namespace) -> Any:
     """The user's model."""
-    from vaneloop.discrepancy import load_system
+    from vaneloop.identification import load_system
 
     return load_system(args.system)
 
@@ -70,8 +70,8 @@ def ask(args: argparse.Namespace, verb: str, **more: Any) -> Any:
     """Ask ``verb`` of `vaneloop.verbs` of the user's model on the logs that ``args`` name; return its answer."""
     from plant import Model
     from vaneloop.base.errors import InputError
-    from vaneloop.discrepancy import StageError, load_system
-    from vaneloop.discrepancy.models.by_log import load_model_of
+    from vaneloop.identification import StageError, load_system
+    from vaneloop.identification.user_models.by_log import load_model_of
     from vaneloop.verbs import learn, search
     from vaneloop.verbs.parts import split
 

@@ -18,20 +18,20 @@ import numpy as np
 from plant.curve import PLACES
 from plant.effects import EFFECTS
 from vaneloop.base.curve import splines
-from vaneloop.discrepancy.curves import basis_of
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.models.curve import COLUMN
-from vaneloop.discrepancy.models.curved import Candidate
-from vaneloop.discrepancy.models.known import Quantity
-from vaneloop.discrepancy.models.memory import is_memory
-from vaneloop.discrepancy.models.vane_stages.declared import ALL_PLACES
-from vaneloop.discrepancy.models.vane_stages.driven import Made
-from vaneloop.discrepancy.models.vane_stages.ground import remade
-from vaneloop.discrepancy.stage import Array, Stage
+from vaneloop.identification.candidates.spline_basis import basis_of
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.subsystem import Array, Stage
+from vaneloop.identification.unmodelled.curve_candidates import Candidate
+from vaneloop.identification.unmodelled.regressors import Quantity
+from vaneloop.identification.user_models.hysteresis_regressors import is_memory
+from vaneloop.identification.user_models.terms import COLUMN
+from vaneloop.identification.vane_chain.candidates import remade
+from vaneloop.identification.vane_chain.parameters import ALL_PLACES
+from vaneloop.identification.vane_chain.subsystem_data import Made
 
 if TYPE_CHECKING:
-    from vaneloop.discrepancy.models.learned import LearnedLaw
-    from vaneloop.discrepancy.models.vanes import Chain
+    from vaneloop.identification.unmodelled.learned_law import LearnedLaw
+    from vaneloop.identification.vane_chain.chain import Chain
 
 __all__ = ["as_a_curve", "like_it", "with_effect"]
 

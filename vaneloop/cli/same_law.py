@@ -30,7 +30,7 @@ def same_by_equations(law: Any, bound: Any, model: Any, at: str, of: str, value:
     law    as learned, on the logs in ``bound``; ``model``: with the true parameters
     at, of, value   place, quantity ("": none) and curve of the hidden law
     """
-    from vaneloop.discrepancy.formulas import values_of
+    from vaneloop.identification.candidates.closed_forms import values_of
 
     world = _World(bound, model)
     own = {
@@ -70,9 +70,9 @@ class _World:
     """A model with its true parameters at values of its states and inputs, drawn independently of each other."""
 
     def __init__(self, bound: Any, model: Any):
-        from vaneloop.discrepancy.models.curve import INPUT, OUTPUT
-        from vaneloop.discrepancy.models.known import quantities
-        from vaneloop.discrepancy.models.user_code import UserCode
+        from vaneloop.identification.unmodelled.regressors import quantities
+        from vaneloop.identification.user_models.terms import INPUT, OUTPUT
+        from vaneloop.identification.user_models.user_code import UserCode
 
         rng = np.random.default_rng(0)
         self.model, self.code = model, UserCode(model, bound.data.in_names)

@@ -49,8 +49,8 @@ def _of_machine(path: str, files: dict[str, str], reading: dict[str, Any]) -> tu
 
 def _of_system(path: str, files: dict[str, str], reading: dict[str, Any]) -> tuple[Diagnosed, Columns]:
     """The same of a user's own system, with what its model file has learned by now."""
-    from vaneloop.discrepancy import StageError, load_system
-    from vaneloop.discrepancy.models.by_log import load_model_of
+    from vaneloop.identification import StageError, load_system
+    from vaneloop.identification.user_models.by_log import load_model_of
     from vaneloop.verbs.search import diagnose, read_record
 
     try:

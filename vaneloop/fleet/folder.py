@@ -61,7 +61,7 @@ _ROOT = Path(__file__).parents[2]
 LEFT_BEHIND = 3600.0  # s since it was last written to, after which nobody is at work on a temporary file
 # what a result follows from: how it is found and written, and the tables of a machine that nobody gave
 _SOURCES = (
-    "controller", "plant", "hil", "vaneloop/base", "vaneloop/discrepancy", "vaneloop/verbs", "vaneloop/fleet"
+    "controller", "plant", "hil", "vaneloop/base", "vaneloop/identification", "vaneloop/verbs", "vaneloop/fleet"
 )  # fmt: skip
 
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from vaneloop.base.signals import heading
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.locate import Located, locate
-from vaneloop.discrepancy.models.by_log import ByLog
-from vaneloop.discrepancy.stage import Bound, Stage
-from vaneloop.discrepancy.stage_answer import StageDiagnosis
-from vaneloop.discrepancy.workflow import Diagnosis
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.regimes import Located, locate
+from vaneloop.identification.results import StageDiagnosis
+from vaneloop.identification.subsystem import Bound, Stage
+from vaneloop.identification.user_models.by_log import ByLog
+from vaneloop.identification.workflow import Diagnosis
 from vaneloop.pages.by_log import curves_by_log, log_by_log
 from vaneloop.pages.failures import failure_map, worst_cell
 from vaneloop.pages.figures import UNDER, Line, Panel, loop, overlay, ranking, waterfall

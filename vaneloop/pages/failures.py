@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from vaneloop.base.signals import heading
-from vaneloop.discrepancy.locate import Regime
+from vaneloop.identification.regimes import Regime
 from vaneloop.pages.figures import Figure, heat
 
 __all__ = ["failure_map", "worst_cell"]

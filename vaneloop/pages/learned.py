@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from vaneloop.base.signals import heading
-from vaneloop.discrepancy.models.by_log import ByLog
-from vaneloop.discrepancy.models.learned import LearnedLaw
-from vaneloop.discrepancy.models.learned_surface import LearnedSurface
-from vaneloop.discrepancy.models.tried import Outcome
+from vaneloop.identification.unmodelled.fitted_candidate import Outcome
+from vaneloop.identification.unmodelled.learned_law import LearnedLaw
+from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
+from vaneloop.identification.user_models.by_log import ByLog
 from vaneloop.pages.by_log import curves_by_log, log_by_log
 from vaneloop.pages.figures import Figure, Line, bars, loop
 from vaneloop.pages.page import Page

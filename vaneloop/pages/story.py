@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vaneloop.discrepancy.locate import Located, agrees
-from vaneloop.discrepancy.stage_answer import Found, StageDiagnosis
-from vaneloop.discrepancy.workflow import Diagnosis
+from vaneloop.identification.regimes import Located, agrees
+from vaneloop.identification.results import Found, StageDiagnosis
+from vaneloop.identification.workflow import Diagnosis
 from vaneloop.pages.style import Tone, capital
 
 __all__ = [

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import write
-from vaneloop.discrepancy import StageError, System
+from vaneloop.identification import StageError, System
 from vaneloop.verbs.answer import Answer
 from vaneloop.verbs.machine import Machine
 from vaneloop.verbs.search import Diagnosed, diagnose, with_fits
@@ -17,12 +17,12 @@ from vaneloop.verbs.search import diagnosed as of_chain
 
 if TYPE_CHECKING:
     from plant import Model
-    from vaneloop.discrepancy.fit import Fit, Judge
-    from vaneloop.discrepancy.models.by_log import ByLog
-    from vaneloop.discrepancy.models.learned import LearnedLaw
-    from vaneloop.discrepancy.models.tried import Outcome, Tried
-    from vaneloop.discrepancy.models.vanes import Chain
-    from vaneloop.discrepancy.stage_answer import StageDiagnosis
+    from vaneloop.identification.least_squares.problem import Fit, Judge
+    from vaneloop.identification.results import StageDiagnosis
+    from vaneloop.identification.unmodelled.fitted_candidate import Outcome, Tried
+    from vaneloop.identification.unmodelled.learned_law import LearnedLaw
+    from vaneloop.identification.user_models.by_log import ByLog
+    from vaneloop.identification.vane_chain.chain import Chain
     from vaneloop.pages.page import Page
 
 __all__ = ["Learned", "learn"]
@@ -115,9 +115,9 @@ class Learned(Answer):
         system  the user's own model, to whose ``laws`` it can be added, or which calls it, of a difference; None: of
                 the vane chain, the function alone, as always where it is one of two quantities
         """
-        from vaneloop.discrepancy.models.learned_surface import LearnedSurface
-        from vaneloop.discrepancy.models.python_law import python_law
-        from vaneloop.discrepancy.models.python_surface import python_surface
+        from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
+        from vaneloop.identification.unmodelled.python_law import python_law
+        from vaneloop.identification.unmodelled.python_surface import python_surface
 
         law = self.laws[0]
         text = python_surface(law) if isinstance(law, LearnedSurface) else python_law(law, system)
@@ -211,11 +211,11 @@ def learned(
     found     the diagnosis of this log, where that has been made
     formulas  whether a formula that does as well as its curve is the law
     """
-    from vaneloop.discrepancy.models.learned import law_of
-    from vaneloop.discrepancy.models.learning import Learner
-    from vaneloop.discrepancy.models.spoken import spoken
-    from vaneloop.discrepancy.models.tried import Outcome
-    from vaneloop.discrepancy.models.vane_stages.ground import VaneGround
+    from vaneloop.identification.unmodelled.fitted_candidate import Outcome
+    from vaneloop.identification.unmodelled.learned_law import law_of
+    from vaneloop.identification.unmodelled.learning import Learner
+    from vaneloop.identification.unmodelled.parametric_substitution import spoken
+    from vaneloop.identification.vane_chain.candidates import VaneGround
 
     tell = progress or (lambda _: None)
     shape = checked_shape(shape)
@@ -272,8 +272,8 @@ def learned(
 
 def _open(chain: Chain, d: StageDiagnosis) -> bool:
     """Whether a stage may lack a law that nobody listed: its error is more than noise, and no law has a name for it."""
-    from vaneloop.discrepancy.fit import Judge
-    from vaneloop.discrepancy.models.at_the_noise import above_the_noise
+    from vaneloop.identification.least_squares.problem import Judge
+    from vaneloop.identification.unmodelled.likelihood_acceptance import above_the_noise
 
     stage = chain.stage(d.stage)
     if stage.made is None or d.verdict == "missing":
@@ -283,7 +283,7 @@ def _open(chain: Chain, d: StageDiagnosis) -> bool:
 
 def _with_stage(model: Model, judge: Judge, fit: Fit) -> Model:
     """The model with a stage's own parameters as they were fitted."""
-    from vaneloop.discrepancy.stage_answer import recalibrated
+    from vaneloop.identification.results import recalibrated
 
     moved = {str(r["parameter"]): float(str(r["value"])) for r in recalibrated(judge.stage, fit)}
     return model.model_copy(update={"parameters": {**model.parameters, **moved}})
@@ -291,7 +291,7 @@ def _with_stage(model: Model, judge: Judge, fit: Fit) -> Model:
 
 def checked_shape(shape: Sequence[str]) -> tuple[str, ...]:
     """What is known of curves; InputError where that is no shape, or no curve has it all."""
-    from vaneloop.discrepancy.models.curved import SHAPES
+    from vaneloop.identification.unmodelled.curve_candidates import SHAPES
 
     for name in shape:
         if name not in SHAPES:
@@ -305,15 +305,15 @@ def checked_shape(shape: Sequence[str]) -> tuple[str, ...]:
 def _learned(
     diagnosed: Diagnosed, added: Model | None, progress: Callable[[float], None], shape: Sequence[str], formulas: bool
 ) -> Learned:
-    from vaneloop.discrepancy.models.by_log import ByLog
-    from vaneloop.discrepancy.models.curved import OwnGround, on_logs
-    from vaneloop.discrepancy.models.learned import law_of
-    from vaneloop.discrepancy.models.learned_surface import LearnedSurface, surface_law_of
-    from vaneloop.discrepancy.models.learning import Learner
-    from vaneloop.discrepancy.models.spoken import spoken
-    from vaneloop.discrepancy.models.surface_formulas import as_the_law, reach_of
-    from vaneloop.discrepancy.models.surfaces import SurfaceCandidate
-    from vaneloop.discrepancy.stage_answer import answer_of, found_of, rms_of
+    from vaneloop.identification.results import answer_of, found_of, rms_of
+    from vaneloop.identification.unmodelled.curve_candidates import OwnGround, on_logs
+    from vaneloop.identification.unmodelled.learned_law import law_of
+    from vaneloop.identification.unmodelled.learned_surface import LearnedSurface, surface_law_of
+    from vaneloop.identification.unmodelled.learning import Learner
+    from vaneloop.identification.unmodelled.parametric_substitution import spoken
+    from vaneloop.identification.unmodelled.surface_candidates import SurfaceCandidate
+    from vaneloop.identification.unmodelled.surface_closed_forms import as_the_law, reach_of
+    from vaneloop.identification.user_models.by_log import ByLog
 
     assert diagnosed.by_log is not None
     logs = diagnosed.by_log.logs
@@ -358,9 +358,9 @@ def _beside_named(
     """
     import numpy as np
 
-    from vaneloop.discrepancy.error_share import HARM, LEAST_FALL, UNKNOWN
-    from vaneloop.discrepancy.fit import Judge
-    from vaneloop.discrepancy.models.by_log import ByLog, as_given, bind
+    from vaneloop.identification.least_squares.problem import Judge
+    from vaneloop.identification.selection.relative_error_acceptance import HARM, LEAST_FALL, UNKNOWN
+    from vaneloop.identification.user_models.by_log import ByLog, as_given, bind
 
     assert diagnosed.by_log is not None
     by, d = diagnosed.by_log, diagnosed.diagnosis.stages[0]
@@ -412,7 +412,7 @@ def _as_model(model: Model, outcome: Outcome, laws: list[LearnedLaw], last: Trie
     last  the model with all of them, as it was fitted
     """
     from plant.model import Learned as Table
-    from vaneloop.discrepancy.models.learned_surface import LearnedSurface
+    from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
 
     effects, curves = dict(model.effects), dict(model.curves)
     for law, tried in zip(laws, outcome.tried, strict=True):

@@ -16,19 +16,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vaneloop.discrepancy.fit import Judge
-from vaneloop.discrepancy.locate import Located
-from vaneloop.discrepancy.scout import spread
-from vaneloop.discrepancy.stage import Array
-from vaneloop.discrepancy.stage_answer import StageDiagnosis, rms_of, weigh
-from vaneloop.discrepancy.whole import BLOCKS, Failing, Sums, failing, joined, of_whole, sums_of
-from vaneloop.discrepancy.workflow import Diagnosis, News, locate_stages, verdict_of
-from vaneloop.discrepancy.workflow import diagnose as search
+from vaneloop.identification.chunked_residuals import BLOCKS, Failing, Sums, failing, joined, of_whole, sums_of
+from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.regimes import Located
+from vaneloop.identification.results import StageDiagnosis, rms_of, weigh
+from vaneloop.identification.selection.subsampled_search import spread
+from vaneloop.identification.subsystem import Array
+from vaneloop.identification.workflow import Diagnosis, News, locate_stages, verdict_of
+from vaneloop.identification.workflow import diagnose as search
 
 if TYPE_CHECKING:
     from hil.logs import Log
-    from vaneloop.discrepancy.models.vane_stages.raster import Grid
-    from vaneloop.discrepancy.models.vanes import Chain
+    from vaneloop.identification.vane_chain.chain import Chain
+    from vaneloop.identification.vane_chain.resample import Grid
     from vaneloop.verbs.machine import Machine
 
 __all__ = ["LONG", "Held", "Whole", "changed", "excerpted", "held_against", "held_results", "located", "searched"]

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from controller import Calibration
     from hil.logs import Log
     from plant import Model, Plant
-    from vaneloop.discrepancy.models.vane_stages.raster import Grid
-    from vaneloop.discrepancy.models.vanes import Chain
+    from vaneloop.identification.vane_chain.chain import Chain
+    from vaneloop.identification.vane_chain.resample import Grid
 
 __all__ = ["TABLES", "Machine", "files_of"]
 
@@ -110,7 +110,7 @@ class Machine:
 
         Raises LogError for a log that shows none of them.
         """
-        from vaneloop.discrepancy.models.vane_stages.raster import grid_of
+        from vaneloop.identification.vane_chain.resample import grid_of
         from vaneloop.verbs.long import LONG, excerpted
 
         grid = grid_of(log)
@@ -119,7 +119,7 @@ class Machine:
     def stages_of(self, log: Log, grid: Grid, pieces: Sequence[tuple[int, int]] = (), **few: int) -> Chain:
         """`bind` of some rows of a log, as `build_chain` takes them; default: of all."""
         from hil.logs import LogError
-        from vaneloop.discrepancy.models.vanes import build_chain
+        from vaneloop.identification.vane_chain.chain import build_chain
 
         present = tuple(self.added.effects)
         chain = build_chain(log, self.plant, self.calibration, present, grid, pieces, **few)

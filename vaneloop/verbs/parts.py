@@ -12,9 +12,9 @@ import numpy as np
 
 from vaneloop.base.errors import InputError
 from vaneloop.base.spans import Span, apart, is_span, spans_of
-from vaneloop.discrepancy import Record, StageError, System
-from vaneloop.discrepancy.fit import Fit, Judge
-from vaneloop.discrepancy.stage import Array, Stage
+from vaneloop.identification import Record, StageError, System
+from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.subsystem import Array, Stage
 
 if TYPE_CHECKING:
     from hil.logs import Log

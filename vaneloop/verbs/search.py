@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from vaneloop.base.errors import InputError
-from vaneloop.discrepancy import Record, StageError, System
-from vaneloop.discrepancy.locate import Located
-from vaneloop.discrepancy.workflow import (
+from vaneloop.identification import Record, StageError, System
+from vaneloop.identification.regimes import Located
+from vaneloop.identification.workflow import (
     Diagnosis,
     News,
     as_compared,
@@ -24,7 +24,7 @@ from vaneloop.discrepancy.workflow import (
     locate_stages,
     no_better,
 )
-from vaneloop.discrepancy.workflow import diagnose as search
+from vaneloop.identification.workflow import diagnose as search
 from vaneloop.verbs.answer import Answer
 from vaneloop.verbs.long import Held, changed, held_results, searched
 from vaneloop.verbs.long import located as located_of
@@ -35,10 +35,10 @@ from vaneloop.verbs.replay import log_of
 if TYPE_CHECKING:
     from hil.logs import Log
     from plant import Model
-    from vaneloop.discrepancy.models.by_log import ByLog, Logs
-    from vaneloop.discrepancy.models.vanes import Chain
-    from vaneloop.discrepancy.stage import Bound
-    from vaneloop.discrepancy.stage_answer import StageDiagnosis
+    from vaneloop.identification.results import StageDiagnosis
+    from vaneloop.identification.subsystem import Bound
+    from vaneloop.identification.user_models.by_log import ByLog, Logs
+    from vaneloop.identification.vane_chain.chain import Chain
     from vaneloop.pages.page import Page
 
 __all__ = [
@@ -246,7 +246,7 @@ def _records(logs: Any, system: System) -> list[Record]:
 
 def _logs(log: Any, system: System, fit: Any, test: Any, added: Model | None) -> tuple[Logs, str]:
     """The records held against a system, and the first one's name."""
-    from vaneloop.discrepancy.models.by_log import bind
+    from vaneloop.identification.user_models.by_log import bind
 
     to_fit, to_test, others = split(fit, test)
     try:
@@ -276,7 +276,7 @@ def compare(
     added  parameters and laws that a `System` has by now; a `Machine` has its own
     """
     if isinstance(model, System):
-        from vaneloop.discrepancy.models.by_log import ByLog, as_given
+        from vaneloop.identification.user_models.by_log import ByLog, as_given
 
         logs, name = _logs(log, model, fit, test, added)
         located = locate_stages(logs.fitted.stages)
@@ -321,7 +321,7 @@ def diagnose(
     workers  stages searched at a time
     """
     if isinstance(model, System):
-        from vaneloop.discrepancy.models.by_log import ByLog
+        from vaneloop.identification.user_models.by_log import ByLog
 
         model = replace(model, without=(*model.without, *without))
         logs, name = _logs(log, model, fit, test, added)
@@ -337,7 +337,7 @@ def not_given(chain: Chain, effects: Sequence[str]) -> Chain:
     """The chain, of whose stages some effects are not looked for."""
     if not effects:
         return chain
-    from vaneloop.discrepancy.models.vane_stages.ground import without_laws
+    from vaneloop.identification.vane_chain.candidates import without_laws
 
     known(effects, "without")
     return changed(chain, lambda c: replace(c, stages=without_laws(c.stages, effects)))
@@ -394,8 +394,8 @@ def extend(
 
 def _extended(logs: Logs, name: str, effects: Sequence[str], added: Model | None) -> Extended:
     """`extend` of a system that has been held against its logs."""
-    from vaneloop.discrepancy.error_share import ErrorShare
-    from vaneloop.discrepancy.models.by_log import ByLog
+    from vaneloop.identification.selection.relative_error_acceptance import ErrorShare
+    from vaneloop.identification.user_models.by_log import ByLog
 
     started = time.perf_counter()
     bound = logs.fitted
@@ -434,7 +434,7 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
     """`extend` of a log that has been put into the stages of the nominal machine; ``before``: the model so far."""
     from plant.curve import PLACES
     from plant.effects import EFFECTS
-    from vaneloop.discrepancy.models.vane_stages.ground import curve_effect, with_laws
+    from vaneloop.identification.vane_chain.candidates import curve_effect, with_laws
 
     started = time.perf_counter()
     by_stage: dict[str, list[str]] = {}
@@ -488,7 +488,7 @@ def with_fits(model: Model, results: Sequence[StageDiagnosis]) -> Model:
     as it was learned, times its scale.
     """
     from plant.effects import EFFECTS
-    from vaneloop.discrepancy.models.vane_stages.ground import SCALE
+    from vaneloop.identification.vane_chain.candidates import SCALE
 
     parameters, effects = dict(model.parameters), dict(model.effects)
     for r in results:
@@ -509,7 +509,7 @@ def experiment(log: Any, model: Machine | Diagnosed | None = None, *, progress: 
 
     model  the machine, or the diagnosis of this log where that has been made
     """
-    from vaneloop.discrepancy.models.experiment import recommend
+    from vaneloop.identification.vane_chain.experiment import recommend
 
     if not isinstance(model, Diagnosed):
         chain, name = chain_for(log, model or Machine())

@@ -15,7 +15,7 @@ from typing import Any
 from nicegui import ui
 from nicegui.element import Element
 
-from vaneloop.discrepancy.locate import agrees
+from vaneloop.identification.regimes import agrees
 from vaneloop.pages.style import THEMES
 from vaneloop.web.charts import figure as figure_of
 from vaneloop.web.jobs import Job

@@ -91,7 +91,7 @@ def ready(progress: Progress) -> None:
     from hil.logs import Channel, Log
     from hil.loop.lockstep import Stimulus, lockstep, warm_up
     from vaneloop.base.signals import UNITS
-    from vaneloop.discrepancy.workflow import locate_stages
+    from vaneloop.identification.workflow import locate_stages
     from vaneloop.verbs.machine import Machine
 
     warm_up(lambda text: progress(None, text))
@@ -150,8 +150,8 @@ def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
 
 def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
     """Compare and locate: errors stage by stage, failure maps, curves."""
-    from vaneloop.discrepancy.fit import Judge
-    from vaneloop.discrepancy.workflow import locate_stages
+    from vaneloop.identification.least_squares.problem import Judge
+    from vaneloop.identification.workflow import locate_stages
     from vaneloop.pages.diagnosis import located_sentence, located_tone
 
     chain = chain_for(words, progress)
@@ -225,8 +225,8 @@ def diagnose(progress: Progress, words: list[str]) -> dict[str, Any]:
 
 def refit(progress: Progress, words: list[str], stage: str, effects: tuple[str, ...]) -> dict[str, Any]:
     """Fit one stage with exactly these effects, as ``vaneloop extend`` does."""
-    from vaneloop.discrepancy.fit import Judge
-    from vaneloop.discrepancy.workflow import extend_stage
+    from vaneloop.identification.least_squares.problem import Judge
+    from vaneloop.identification.workflow import extend_stage
 
     chain = chain_for(words, progress)
     s = chain.stage(stage)
@@ -255,7 +255,7 @@ def hand(
     """
     import numpy as np
 
-    from vaneloop.discrepancy.fit import Judge
+    from vaneloop.identification.least_squares.problem import Judge
 
     chain = chain_for(words, progress)
     s = chain.stage(stage)
@@ -273,7 +273,7 @@ def hand(
 
 def experiment(progress: Progress, words: list[str], diagnosis: Any) -> dict[str, Any] | None:
     """Recommend the next experiment, as ``vaneloop experiment`` does."""
-    from vaneloop.discrepancy.models.experiment import recommend
+    from vaneloop.identification.vane_chain.experiment import recommend
 
     chain = chain_for(words, progress)
     return recommend(diagnosis, lambda f: progress(f, "trying demand profiles"), chain)

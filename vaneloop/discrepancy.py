@@ -1,0 +1,7 @@
+"""The former name of `vaneloop.identification`, for one version."""
+
+import sys
+
+from vaneloop.identification.user_models.load import FormerName
+
+sys.modules[__name__] = FormerName(__name__, __doc__)

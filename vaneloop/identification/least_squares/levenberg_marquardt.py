@@ -1,0 +1,168 @@
+"""The steps of a fit: Levenberg-Marquardt with bounds, three dampings at a time.
+
+Slopes are simulated, a parameter set for each free parameter, or carried on from the last step
+(`identification.least_squares.broyden`). A step by carried slopes costs the three trials alone. They are simulated anew
+where such a step brings much less than they promised, or less for its cost than the last step by simulated ones; and a
+descent does not end before simulated slopes say so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Carried, Known, bounded_step
+from vaneloop.identification.subsystem import Array
+
+if TYPE_CHECKING:
+    from vaneloop.identification.least_squares.problem import Judge
+
+__all__ = ["EVIDENCE", "STILL", "Begin", "End", "carries", "descent"]
+
+# Independent observations of an output that a log is worth at most: the model's equations are not nature's, and an
+# error of form does not average out however long the log. Set on logs of the rig, so that intervals cover the truth as
+# often as they say (docs/diagnosis.md).
+EVIDENCE = 200.0
+STILL = 1e-3  # share by which a fit that goes on must fall, of a model whose own parameters are known roughly
+DAMPED = (0.01, 1.0, 300.0)  # times the damping so far, tried at one time
+MOST_DAMPED = 4  # tries at ever shorter steps, down to some 1e-15 of a full one
+KEPT = 0.5  # share of what slopes promised that a step must bring for them to be carried on
+STEP = 0.34  # of an iteration that a step by carried slopes counts at least
+CARRIED = 400_000  # values of slopes that are carried along by one fit, 3 MB
+
+Linear = tuple[Array, Array, Array]  # costs, gradients and normals of the blocks
+
+
+class Begin(NamedTuple):
+    """Where a descent begins.
+
+    linear  costs, gradients and normals of the blocks there, where they are known; then ``slopes`` may be errors and
+            slopes at the very place
+    near    slopes near there, as far as they are known
+    weights of the blocks; None: 1
+    """
+
+    theta: Array
+    linear: Linear | None = None
+    slopes: tuple[Array, Array] | None = None
+    near: Known = NOT_KNOWN
+    weights: Array | None = None
+
+
+class End(NamedTuple):
+    """Where a descent has come to.
+
+    total   what it minimises there
+    errors  whitened errors there; ``linear``: costs, gradients and normals of the blocks; None: they are not known
+    near    slopes near there, as far as they are known
+    """
+
+    theta: Array
+    total: float
+    free: Array
+    prior: Array
+    errors: Array | None
+    linear: Linear | None
+    stalled: bool
+    near: Known
+
+
+def carries(judge: Judge, free: Array) -> bool:
+    """Whether slopes by these columns are carried along: a stage may not want that, and they may be too many."""
+    return judge.stage.carries and len(free) * judge.measured.size <= CARRIED
+
+
+def descent(judge: Judge, free: Array, begin: Begin, iterations: int) -> Generator[Array, Array, End]:
+    """The steps of a `identification.least_squares.problem.Judge.fitting` in these columns."""
+    low, high = judge.bounds()
+    theta, linear, weights = judge.wrapped(np.clip(begin.theta, low, high)), begin.linear, begin.weights
+    expected, prior, scale = judge.stage.expected(), judge._prior[free], judge.scale[free]
+    block_weights = np.ones(judge.n_blocks) if weights is None else weights
+
+    def total(cost: Array, thetas: Array) -> Array:
+        return cost @ block_weights + np.sum(prior * (thetas[:, free] - expected[free]) ** 2, axis=1)
+
+    may_carry = weights is None and carries(judge, free)
+    carried = Carried(*begin.slopes) if begin.slopes is not None and may_carry else None
+    fresh = True  # whether the next step goes by slopes that are simulated
+    damping, stalled, here, lately = 1e-3, False, np.inf, 0.0
+    known: Array | None = None  # errors at theta
+    if linear is None and may_carry and iterations and begin.near.fits(judge.measured.size):
+        asked, all_slopes = judge._begun(theta, free, begin.near)
+        known, slopes = all_slopes((yield asked))
+        carried, fresh = Carried(known, slopes), False
+        here = float(total(judge.block_costs(known[None]), theta[None])[0])
+    left, carried_step = float(iterations), max(STEP, len(DAMPED) / (len(DAMPED) + max(len(free), 1)))
+    first = ahead = True  # whether no step was made; whether the last was made by simulated slopes
+    while left > 1e-9:
+        left -= 1.0 if fresh else carried_step
+        if fresh and linear is None:
+            asked, derivative = judge._differences(theta, free, scale, high, known)
+            error, slopes = derivative((yield asked))
+            linear = judge._blocks(error, slopes)
+            carried = Carried(error, slopes) if may_carry else None
+        if linear is not None:
+            here = float(total(linear[0][None], theta[None])[0])
+            a, g = np.tensordot(block_weights, linear[2], 1), block_weights @ linear[1]
+        else:
+            assert carried is not None
+            a, g = carried.normal, carried.gradient
+        if len(free) == 0:
+            break
+        little = 0.2 * len(free)
+        if judge.roughly:
+            little *= 1.0 + max(here - judge.n, 0.0) / EVIDENCE
+        least = max(little, STILL * (here - judge.n)) if judge.sparing else little
+        a, g = a + np.diag(prior * scale**2), g - prior * scale * (theta[free] - expected[free])
+        limits = [(b[free] - theta[free]) / scale for b in (low, high)]
+        if (judge.roughly and not first) or (fresh and not ahead):
+            step = bounded_step(a + 1e-9 * np.diag(np.maximum(np.diag(a), 1e-9)), g, *limits)
+            if _promised(step, a, g) < (little if ahead else least):  # not even the slope promises more
+                if fresh:
+                    break
+                fresh = True
+                continue
+        first, ahead = False, fresh
+        for _ in range(MOST_DAMPED if fresh else 1):
+            trials, steps = [], []
+            for factor in DAMPED:
+                damped = a + damping * factor * np.diag(np.maximum(np.diag(a), 1e-9))
+                step = bounded_step(damped, g, *limits)
+                trial = theta.copy()
+                trial[free] = np.clip(theta[free] + step * scale, low[free], high[free])
+                steps.append((trial[free] - theta[free]) / scale)
+                trials.append(judge.wrapped(trial))
+            thetas = np.array(trials)
+            errors = yield thetas
+            costs = total(judge.block_costs(errors), thetas)
+            k = int(np.argmin(costs))
+            # the last step is the shortest: where even it promises much and nothing came of it, the slope is not to be
+            # trusted so far away
+            stalled = fresh and not costs[k] < here and _promised(step, a, g) > little
+            if not stalled:
+                break
+            damping *= 1e5
+        gained = here - float(costs[k])
+        if gained > 0.0:
+            damping, theta, known, linear = max(damping * DAMPED[k], 1e-9), thetas[k], errors[k].copy(), None
+            here = float(costs[k])
+        if not gained > 0.0 or gained < least:
+            if fresh:
+                break
+            fresh = True  # the slopes that were carried here may be wrong
+            continue
+        if fresh:
+            lately = gained * len(DAMPED) / (len(DAMPED) + len(free))
+        keep = carried is not None and gained > max(KEPT * _promised(steps[k], a, g), lately)
+        if keep and carried is not None and known is not None:
+            carried.moved(steps[k], known)
+        fresh = not keep
+    near = Known(free, carried.slopes) if carried is not None else NOT_KNOWN
+    return End(theta, here, free, prior, known, linear, stalled, near)
+
+
+def _promised(step: Array, a: Array, g: Array) -> float:
+    """How much less a step leaves by its normal equations."""
+    return 2.0 * float(step @ g) - float(step @ a @ step)

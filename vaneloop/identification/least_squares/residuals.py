@@ -1,0 +1,82 @@
+"""The error of a model in noise floors, as fits compare it: 0 where nothing was measured, far off where the model gives
+no number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from vaneloop.base.compiled import compiled_free
+from vaneloop.identification.subsystem import Array
+
+__all__ = ["FAR", "Latest", "whiten"]
+
+FAR = 1e6  # noise floors: the error of a sample of which the model says nothing; no fit ends there
+
+
+@compiled_free
+def whiten(
+    model: np.ndarray, measured: np.ndarray, counted: np.ndarray, floor: np.ndarray, starts: np.ndarray, out: np.ndarray
+) -> None:
+    """Fill out[set, output, sample] with (measured - model) / floor, less its mean over each window.
+
+    model     [sets, outputs, samples]; a value that is not finite is off by `FAR`
+    measured  [outputs, samples], finite
+    counted   1.0 where a sample counts, else 0.0: [outputs, samples]
+    floor     of each output
+    starts    first samples of the windows; none: nothing is taken off
+    """
+    sets, outputs, n = model.shape
+    for k in range(sets):
+        for o in range(outputs):
+            e, to_floor = out[k, o], 1.0 / floor[o]
+            for i in range(n):
+                error = measured[o, i] - model[k, o, i]
+                e[i] = counted[o, i] * (error * to_floor if math.isfinite(error) else FAR)
+            for w in range(len(starts)):
+                end = starts[w + 1] if w + 1 < len(starts) else n
+                total = many = 0.0
+                for i in range(starts[w], end):
+                    total += e[i]
+                    many += counted[o, i]
+                mean = total / max(many, 1.0)
+                for i in range(starts[w], end):
+                    e[i] -= mean * counted[o, i]
+
+
+# ---- Errors of the parameter sets that were simulated last: one set in ten is asked for again soon
+
+VALUES = 4_000_000  # that are kept, 32 MB
+
+
+class Latest:
+    """What was simulated last, by its parameters, bit for bit."""
+
+    def __init__(self) -> None:
+        self._kept: dict[bytes, Array] = {}
+
+    def errors(self, thetas: Array, simulate: Callable[[Array], Array]) -> Array:
+        """Return float64[sets, outputs, samples]: what ``simulate`` makes of those sets that are not there."""
+        keys = [theta.tobytes() for theta in thetas]
+        new: dict[bytes, int] = {}
+        for i, key in enumerate(keys):
+            if key not in self._kept:
+                new.setdefault(key, i)
+        if len(new) == len(keys):
+            made = out = simulate(thetas)
+            if not keys:
+                return out
+        else:
+            made = simulate(thetas[list(new.values())]) if new else thetas
+            of = {**self._kept, **dict(zip(new, made, strict=False))}
+            out = np.array([of[key] for key in keys])
+        most = VALUES // max(out[0].size, 1)
+        first = max(len(new) - most, 0)
+        for key, errors in list(zip(new, made, strict=False))[first:]:
+            self._kept[key] = errors.copy()
+        while len(self._kept) > most:
+            del self._kept[next(iter(self._kept))]
+        return out

@@ -1,0 +1,292 @@
+"""Which effects is a stage missing? Screening, pairs of the leaders, pruning, rivals, and what is left.
+
+The fits are those of `identification.selection.search`. What earns an effect its place is for the criterion to say:
+`NoiseFloor` for a model that may come down to the noise of its log, `ErrorShare` for one that will not.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from vaneloop.identification.least_squares.problem import Fit, Judge, recalibrate
+from vaneloop.identification.results import Candidate, StageDiagnosis, answer_of, found_of, parameters_of, rms_of
+from vaneloop.identification.selection.likelihood_acceptance import TOLERATED, NoiseFloor
+from vaneloop.identification.selection.search import Criterion, Search
+from vaneloop.identification.selection.subsampled_search import excerpt_of, searched
+from vaneloop.identification.subsystem import Array, Stage, StageError, noise_of, reach_of
+
+__all__ = ["Judged", "diagnose_stage", "extend_stage", "floor_of"]
+
+LONG = 60_000  # samples; a stage with more is searched on an excerpt
+SEARCHED = 40_000  # samples of an excerpt, about
+PIECE = 4_000  # samples in a row: longer than the memory of any stage here
+WAYS = 2  # leading effects from which else pairs are tried, where those found leave more than noise
+
+Judged = Callable[[Judge], Criterion]  # makes the criterion of a stage
+Said = tuple[Search, Fit, list[Candidate], list[tuple[str, float]]]
+
+
+def floor_of(stage: Stage) -> Array:
+    """The stage's noise floor, which whoever made the stage must have given."""
+    if stage.floor is None or not np.all(np.isfinite(stage.floor)):
+        raise StageError(f"stage {stage.name!r}: no noise floor")
+    return stage.floor
+
+
+def diagnose_stage(
+    stage: Stage,
+    floor: Array,
+    keep: Array | None = None,
+    tick: Callable[[], None] | None = None,
+    judged: Judged = NoiseFloor,
+) -> StageDiagnosis:
+    """Search the stage's library for what is missing; see `_search`.
+
+    floor   RMS of each output's error when nothing is missing
+    keep    samples that count
+    tick    called after every fit, for a progress bar
+    judged  what an effect must do to be named
+
+    A stage with very many samples is searched on an excerpt: half of it evenly spaced, half where the model fails most.
+    What is found there is fitted to the whole log and has to earn its place again; where the whole log shows more, a
+    second excerpt is taken from what is left.
+    """
+    if stage.excerpt is None or len(stage.t) < LONG:
+        return _unless_coarse(stage, _to_the_floor(stage, floor, keep, tick, judged))
+    judge = Judge(stage, floor, keep)
+    at = excerpt_of(judge, None, PIECE, SEARCHED)
+    even = Judge(stage.excerpt(at), floor, None if keep is None else keep[..., at])
+    base = judge.fit((), recalibrate(even).theta)  # from near it, where few steps are left
+    left = base
+    for _ in range(2):
+        at = excerpt_of(judge, left, PIECE, SEARCHED)
+        part = stage.excerpt(at)
+        said = _to_the_floor(part, floor, None if keep is None else keep[..., at], tick, judged)
+        found = _confirm(stage, keep, floor, base, said, judged)
+        if found.verdict != "unknown" or said.verdict == "unknown":
+            break
+        left = found.final
+    return _unless_coarse(stage, found)
+
+
+def _unless_coarse(stage: Stage, said: StageDiagnosis) -> StageDiagnosis:
+    """The answer; "unknown" where it would rest on a channel that lacks bits, or explains one."""
+    if stage.coarse and (said.effects or any(o in stage.coarse for o in stage.outputs)):
+        nearest = [f.effect for f in said.effects] or said.nearest
+        said = replace(said, verdict="unknown", nearest=nearest, effects=[], refused=list(stage.coarse.values()))
+    return said
+
+
+def _confirm(
+    stage: Stage, keep: Array | None, floor: Array, base: Fit, said: StageDiagnosis, judged: Judged
+) -> StageDiagnosis:
+    """Fit what an excerpt said to the whole log; an effect that the whole log does not need is dropped."""
+    judge = Judge(stage, said.floor, keep)
+    criterion = judged(judge)
+    nominal = base if np.array_equal(floor, said.floor) else judge.fit((), base.theta, 4)
+    chosen, current = said.final.effects, nominal
+    if chosen:
+        current = judge.fit(chosen, said.final.theta, 8)
+        if judge.total_of(current) > judge.total_of(nominal):  # what suits the excerpt may suit nothing else
+            current = judge.fit(chosen, nominal.theta, 8)
+    criterion.learn(current)
+    while chosen:
+        rest = [tuple(c for c in chosen if c != name) for name in chosen]
+        tasks = [judge.fitting(r, np.where(_allowed(stage, r), current.theta, stage.neutral()), 6) for r in rest if r]
+        without = judge.together(tasks) if rest[0] else [nominal]
+        idle = [k for k, f in enumerate(without) if not criterion.earns(f, current)]
+        if not idle:
+            break
+        chosen, current = rest[idle[0]], without[idle[0]]
+    effects = [
+        replace(f, parameters=parameters_of(stage, current, f.effect)) for f in said.effects if f.effect in chosen
+    ]
+    steps = [("nominal", rms_of(judge, nominal))]
+    if chosen:
+        steps.append((" + ".join(chosen), rms_of(judge, current)))
+    return criterion.conclude(nominal, current, effects, said.candidates, steps)
+
+
+def _allowed(stage: Stage, effects: tuple[str, ...]) -> Array:
+    """Columns that a model with only these effects may have away from neutral: bool[parameters]."""
+    out = np.ones(len(stage.all_parameters()), dtype=bool)
+    for name, columns in stage.index().items():
+        out[columns] = name in effects
+    return out
+
+
+def _down_to(stage: Stage, floor: Array, ask: Callable[[Array, bool], tuple[Fit, Said]]) -> Said:
+    """Ask with the floor, measured again on the errors of the best model where it was too high, and once more with
+    what a model with these effects can reach at all.
+
+    A gross effect makes the nominal model's error move so fast that it passes for noise.
+
+    ask  function from a floor, and whether it is the last word, to the best fit and the answer
+    """
+    for attempt in range(3):
+        fit, said = ask(floor, False)
+        if stage.noise is None or attempt == 2:
+            break
+        lower = noise_of(stage, fit.theta)
+        if not np.any(lower < 0.9 * floor):
+            break
+        floor = np.minimum(lower, floor)
+    reach = reach_of(stage, floor, fit.theta)  # nobody can come closer than that
+    return ask(reach, True)[1] if np.any(reach > floor) else said
+
+
+def _to_the_floor(
+    stage: Stage, floor: Array, keep: Array | None, tick: Callable[[], None] | None, judged: Judged
+) -> StageDiagnosis:
+    """Search down to the floor, name what was found, and conclude."""
+
+    def ask(floor: Array, last: bool) -> tuple[Fit, Said]:
+        judge = Judge(stage, floor, keep)
+        begun: Judged = partial(NoiseFloor, known=TOLERATED - 1.0) if last else judged
+        said = _search(searched(begun(judge), begun, tick))
+        return said[1], said
+
+    search, current, candidates, steps = _down_to(stage, floor, ask)
+    effects, current = search.criterion.name(search, current, candidates)
+    d = search.criterion.conclude(search.first, current, effects, candidates, steps)
+    if search.base is not search.first:
+        was, now = (rms_of(search.judge, f) for f in (search.first, search.base))
+        d.notes.append(
+            f"with nothing added {stage.name} comes to {now:.4g} noise floors, not {was:.4g}, from where the search led"
+        )
+    return d
+
+
+def _search(search: Search) -> Said:
+    """Search the stage's library for what is missing: the search, the best model, all effects alone, steps."""
+    judge, stage, criterion, base = search.judge, search.stage, search.criterion, search.base
+    names = [e.name for e in stage.effects]
+    singles = dict.fromkeys(names, base) if search.quiet else search.singles(names)
+    leader = min(singles.values(), key=criterion.order, default=base)
+    criterion.learn(leader)
+    candidates = []
+    for name, fit in singles.items():
+        why = "" if criterion.shows(search.reach[name]) else stage.effect(name).excites or "this log does not excite it"
+        candidates.append(Candidate(name, *criterion.gain(base, fit), why, rms_of(judge, fit)))
+    candidates.sort(key=lambda c: -c.nats)
+
+    current, steps = base, [("nominal", rms_of(judge, base))]
+    tried = -1
+    while len(criterion.left_out) > tried:  # what was left out in the end may have stood in another's way
+        tried = len(criterion.left_out)
+        current = _grown(search, current, singles, [c.effect for c in candidates], steps)
+        grown = current.effects
+        current = criterion.settle(search, search.pruned(current))
+        if current.effects and current.effects != grown:
+            steps.append((" + ".join(current.effects), rms_of(judge, current)))
+    current = search.fits[frozenset(current.effects)] = criterion.spared(current)
+    return search, current, candidates, steps
+
+
+def _grown(
+    search: Search, current: Fit, singles: dict[str, Fit], ranked: list[str], steps: list[tuple[str, float]]
+) -> Fit:
+    """The model with effects added, one by one or the leading two at once, as long as each earns its place; ``steps``
+    gets a line for each.
+    """
+    criterion, names = search.criterion, [e.name for e in search.stage.effects]
+    while len(current.effects) < criterion.most and criterion.fails(current):
+        names = [m for m in names if m not in (*current.effects, *criterion.left_out)]
+        options: list[Fit] = []
+        if current.effects:
+            options += search.best_of([(*current.effects, m) for m in names])
+        else:
+            options += [f for m, f in singles.items() if m in names]
+            leaders = [m for m in ranked if m in names][: criterion.leaders]
+            alone = [f for f in options if criterion.earns(current, f)]
+            # of a model that roams, pairs are tried where no effect helps alone; else where the best one leaves more
+            # than noise, and no other makes up for that beside it
+            tried = list(options)
+            if not criterion.roams and alone and _least(search, tried) > TOLERATED:
+                (first,) = min(alone, key=criterion.order).effects
+                tried += search.best_of([(first, m) for m in names if m != first])
+            if tried and not (criterion.roams and alone) and _least(search, tried) > TOLERATED:
+                options += search.best_of(list(itertools.combinations(leaders, 2)))
+        ok = [f for f in options if criterion.earns(current, f)]
+        if not ok and (other := _on_another_way(search, current, singles)) is not None:
+            ok = [other]
+        if not ok:
+            break
+        # fewest effects first: a pair must be significantly better than the best single, and that above the floor
+        ok.sort(key=lambda f: (len(f.effects), criterion.order(f)))
+        best = ok[0]
+        for f in ok[1:]:
+            if len(f.effects) == len(best.effects):
+                if criterion.order(f) < criterion.order(best):
+                    best = f
+            elif criterion.fails(best) and criterion.earns(best, f):
+                best = f
+        current = best
+        steps.append((" + ".join(current.effects), rms_of(search.judge, current)))
+    return current
+
+
+def _least(search: Search, fits: list[Fit]) -> float:
+    """The least that one of these leaves, in noise floors."""
+    return min(rms_of(search.judge, f) for f in fits)
+
+
+def _on_another_way(search: Search, current: Fit, singles: dict[str, Fit]) -> Fit | None:
+    """A pair with another leading effect than those of a model that grows no more, where that does better; None: none.
+
+    What leads alone may make up for two effects at once: an upper tank that cannot rise, for its overflow and for the
+    limit of the lower one.
+    """
+    criterion = search.criterion
+    if not criterion.roams or not current.effects or len(current.effects) > 2:
+        return None
+    others = [m for m, f in singles.items() if criterion.earns(search.base, f)]
+    others = [m for m in others if m not in (*current.effects, *criterion.left_out)]
+    others.sort(key=lambda m: criterion.order(singles[m]))
+    names = [e.name for e in search.stage.effects if e.name not in criterion.left_out]
+    pairs = [f for o in others[:WAYS] for f in search.best_of([(o, m) for m in names if m != o])[:1]]
+    pairs = [f for f in pairs if set(f.effects) != set(current.effects) and criterion.earns(current, f)]
+    return min(pairs, key=criterion.order, default=None)
+
+
+def extend_stage(
+    stage: Stage, effects: tuple[str, ...], tick: Callable[[], None] | None = None, judged: Judged = NoiseFloor
+) -> StageDiagnosis:
+    """Fit a stage with exactly these effects, one added after the other; ``tick`` is called after each fit.
+
+    The result's steps are the waterfall: nominal model, each effect, the error of the model's own numerical step.
+    Errors are held-out.
+    Raises StageError for an effect that the stage does not have.
+    """
+    for e in effects:
+        if all(e != x.name for x in stage.effects):
+            raise StageError(
+                f"stage {stage.name!r} has no effect {e!r}; it has {', '.join(x.name for x in stage.effects)}"
+            )
+
+    def ask(floor: Array, _: bool) -> tuple[Fit, Said]:
+        judge = Judge(stage, floor)
+        search = Search(judged(judge), tick)
+        search.singles(effects)
+        order: tuple[str, ...] = ()
+        steps = [("nominal", rms_of(judge, search.base))]
+        while len(order) < len(effects):
+            order = search.best_of([(*order, e) for e in effects if e not in order])[0].effects
+            steps.append((f"+ {order[-1]}", rms_of(judge, search.joined(order))))
+        fit = search.criterion.spared(search.joined(order))
+        return fit, (search, fit, [], steps)
+
+    search, fit, _, steps = _down_to(stage, floor_of(stage), ask)
+    judge = search.judge
+    if stage.finer is not None:
+        d = judge.errors(fit.theta[None]) - judge._whiten(stage.finer(fit.theta[None]))
+        numerical = float(np.sqrt(np.sum(d * d) / max(judge.n, 1)))
+        steps.append(("without numerical error", float(np.sqrt(max(rms_of(judge, fit) ** 2 - numerical**2, 0.0)))))
+    verdict = "missing" if effects else "none"
+    without = {e: search.joined(tuple(m for m in effects if m != e)) for e in effects}
+    return answer_of(judge, verdict, search.base, fit, found_of(judge, fit, effects, without), steps)

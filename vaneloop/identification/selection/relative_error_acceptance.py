@@ -1,0 +1,369 @@
+"""The criterion of a model that will not come down to its sensors' noise: an effect must earn its place by what it does
+to the held-out error itself.
+
+On real data small effects that nobody models dominate what is left. A threshold in noise floors or in nats then "finds"
+everything, since the errors of a wrong model are large, correlated and alike from sample to sample. So, block by block
+(blocks as in `identification.least_squares.problem`):
+
+- `LEAST_FALL`: what the held-out sum of squares has beyond noise falls by at least this share, and by at least
+  `LEAST_OF_NOISE` of the noise, whose level is known no better, and by what an error of `FORM` of all that laws are to
+  explain would be: the next law must not patch the form of those before it;
+- `LEAST_HELP`: of all relative change, block by block, at least this share is improvement. Relative, so that a block of
+  small motion, which is wrong by a constant that suits the large motions, counts as much as they do; a block that is
+  nearly perfect (`FLAT`, or the noise) cannot get better or worse;
+- at least two blocks agree;
+- no log that was kept for the test gets clearly worse (`HARM`), and some log gets better (`LEAST_USE`).
+
+The order in which sets of effects are preferred is `score`: the mean of the log error over all samples and of the log
+errors of the blocks, and 1 % for every parameter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.regimes import agrees
+from vaneloop.identification.results import Candidate, Found, StageDiagnosis, answer_of, at_bound, parameters_of, rms_of
+from vaneloop.identification.subsystem import Array
+
+if TYPE_CHECKING:
+    from vaneloop.identification.selection.search import Search
+
+__all__ = ["LEAST_FALL", "ErrorShare", "structure", "worth"]
+
+LEAST_FALL = 0.20  # share of the held-out sum of squares beyond noise that an effect must explain
+LEAST_OF_NOISE = 0.10  # and share of the noise (5 % of its RMS)
+FORM = 0.02  # of the error that laws are to explain: no equation of friction or flow is known better
+LEAST_HELP = 0.75  # share of the change over the blocks that is improvement
+AGREE = 0.05  # fall of a block's log mean square that counts as agreement
+FLAT = 0.1  # of the whole log's error: a block with less is as good as perfect
+PER_PARAMETER = 0.01  # log error that a parameter costs when sets are compared
+RIVAL = 0.05  # log error within which two effects do equally well
+BETTER = 0.02  # log error by which one must be better to be exchanged for another
+HARM = 0.10  # log error by which a test log may get worse
+LEAST_USE = 0.02  # log error by which some log must get better
+UNKNOWN = 1.25  # times the most noise that the samples can hold: what is left is not noise, whatever predicts it
+MOST_LEFT = 0.25  # of the sum of squares beyond noise may be left: what does not even halve the error is not the answer
+STRUCTURE = 0.25  # share of the error left that the logged channels predict, from which it is called unknown physics
+
+Figures = Callable[[Array], Mapping[str, float]]  # parameters -> log -> log of its RMS error
+
+
+@dataclass
+class Evidence:
+    """What one fit gains on another, on held-out blocks.
+
+    fall   share of the sum of squares by which it falls
+    help   share of the change, block by block, that is improvement
+    agree  blocks that improve
+    least  share by which the sum of squares must fall
+    """
+
+    fall: float
+    help: float
+    agree: int
+    least: float = LEAST_FALL
+
+    @property
+    def good(self) -> bool:
+        """Whether it is enough."""
+        return self.fall >= self.least and self.help >= LEAST_HELP and self.agree >= 2
+
+
+def _levels(judge: Judge, fit: Fit, least: float = 1.0) -> tuple[Array, Array]:
+    """Held-out sum of squares of every block, not below ``least`` (noise floors, RMS), and the number of samples."""
+    use = judge.samples > 0
+    m = judge.samples[use].astype(float)
+    return np.maximum(fit.held_out[use], m * least * least), m
+
+
+def worth(judge: Judge, before: Fit, after: Fit, form: float = 0.0) -> Evidence:
+    """Evidence for ``after`` against ``before``.
+
+    form  error (noise floors) by which the equations of what is in the model already may be wrong
+    """
+    flat = max(1.0, FLAT * rms_of(judge, before))
+    (a, _), (b, _) = _levels(judge, before, flat), _levels(judge, after, flat)
+    r = np.log(a / b)
+    change = float(np.abs(r).sum())
+    was, noise = float(_levels(judge, before)[0].sum()), float(judge.n)
+    fall = 1.0 - float(_levels(judge, after)[0].sum()) / was
+    least = max(LEAST_FALL * (was - noise), LEAST_OF_NOISE * noise, form * form * noise) / was
+    helps = float(np.maximum(r, 0.0).sum()) / change if change > 0 else 0.0
+    return Evidence(fall, helps, int(np.sum(r > AGREE)), least)
+
+
+def score(judge: Judge, fit: Fit, blocks: Array | None = None) -> float:
+    """Log of the held-out error, half over all samples, half over the blocks; less is better. ``blocks``: a resampling
+    of them. Near a noise that is known: of the error itself, in its stage's ``grain``.
+    """
+    if judge.stage.grain < 1.0:
+        log_error = 0.5 * float(np.log(fit.held_out.sum() / max(judge.n, 1)))
+        return log_error / judge.stage.grain + PER_PARAMETER * len(fit.free)
+    s, m = _levels(judge, fit)
+    if blocks is not None:
+        s, m = s[blocks], m[blocks]
+    return (
+        0.25 * float(np.log(s.sum() / m.sum())) + 0.25 * float(np.mean(np.log(s / m))) + PER_PARAMETER * len(fit.free)
+    )
+
+
+class ErrorShare:
+    """The criterion (`identification.selection.search.Criterion`).
+
+    figures  function from parameters to the log of the RMS error on each log, fitted or not
+    tests    names of those that are not fitted: they veto what harms them, and choose among rivals
+    """
+
+    most, leaders, fitted, finished, least, roams = 6, 4, 8, 3, 0.0, True
+
+    def __init__(self, judge: Judge, figures: Figures | None = None, tests: frozenset[str] = frozenset()):
+        self.judge, self.figures, self.tests = judge, figures, tests
+        self.form = 0.0
+        self.notes: list[str] = []
+        self.left_out: dict[str, str] = {}  # effect that helped -> why it is not named
+
+    def begin(self, base: Fit) -> None:
+        """Note what the laws are to explain: their form is known to a share of it."""
+        self.form = FORM * rms_of(self.judge, base)
+
+    def learn(self, fit: Fit) -> None:
+        """Nothing: the errors are not compared with noise."""
+
+    def order(self, fit: Fit) -> float:
+        """The score; of equal ones the first in the library, which begins with the plainest, is taken."""
+        return round(score(self.judge, fit), 4)
+
+    def fails(self, fit: Fit) -> bool:
+        """Whether there is any error beyond the samples' noise."""
+        return not agrees(rms_of(self.judge, fit), 1.0)
+
+    def shows(self, reach: float) -> bool:
+        """Every effect that changes an output at all can be seen."""
+        return reach > 0.0
+
+    def earns(self, before: Fit, after: Fit) -> bool:
+        """Whether the evidence is good."""
+        return worth(self.judge, before, after, self.form).good
+
+    def gain(self, before: Fit, after: Fit) -> tuple[float, float]:
+        """Per cent of the held-out error; share of the change that is improvement."""
+        judge = self.judge
+        per_cent = 100.0 * (1.0 - rms_of(judge, after) / max(rms_of(judge, before), 1e-300))
+        return per_cent, worth(judge, before, after, self.form).help
+
+    # ---- the best model ----------------------------------------------------------------------------------------------
+
+    def settle(self, search: Search, fit: Fit) -> Fit:
+        """The model with effects exchanged for better and for simpler ones, and without what is not needed."""
+        names = [e.name for e in self.judge.stage.effects if e.name not in self.left_out]
+        return self._harmless(search, self._simpler(search, self._swapped(search, fit, names), names))
+
+    def _swapped(self, search: Search, fit: Fit, names: list[str]) -> Fit:
+        """Exchange one effect for another where that is better: what was right first need not be right last. One with
+        more parameters must be worth them.
+        """
+        for _ in range(2):
+            best = fit
+            for drop in fit.effects:
+                rest = tuple(e for e in fit.effects if e != drop)
+                options = search.best_of([(*rest, n) for n in names if n not in fit.effects])
+                better = [f for f in options if self.order(f) < self.order(best) - BETTER]
+                best = next((f for f in better if len(f.free) <= len(best.free) or self.earns(best, f)), best)
+            if best is fit:
+                return fit
+            fit = search.pruned(best)
+        return fit
+
+    def _simpler(self, search: Search, fit: Fit, names: list[str]) -> Fit:
+        """Exchange an effect of many parameters for one or two with fewer in all, where it is not worth the difference:
+        a flexible law stands in for whatever bends.
+        """
+        size = {e.name: len(e.parameters) for e in self.judge.stage.effects}
+        for drop in [e for e in fit.effects if size[e] > 1]:
+            rest = search.joined(tuple(e for e in fit.effects if e != drop))
+            free = [n for n in names if n not in rest.effects and size[n] < size[drop]]
+            one = [f for f in search.best_of([(*rest.effects, n) for n in free]) if self.earns(rest, f)]
+            single = [n for n in free if size[n] == 1] if size[drop] > 2 else []
+            two = [
+                g
+                for f in [f for f in one if f.effects[-1] in single][:2]
+                for g in search.best_of([(*f.effects, n) for n in single if n not in f.effects])
+                if self.earns(f, g)
+            ]
+            held = search.simpler(fit, drop)
+            options = [f for f in (*one, *two, *held) if len(f.free) < len(fit.free) and not self.earns(f, fit)]
+            if options:
+                fit = min(options, key=self.order)
+        return fit
+
+    def _harmless(self, search: Search, fit: Fit) -> Fit:
+        """Take out what makes a test log clearly worse, and what no log is better for."""
+        while self.figures is not None and fit.effects:
+            with_it = self.figures(fit.theta)
+            for name in fit.effects:
+                without = search.without(fit, name)
+                change = {log: with_it[log] - v for log, v in self.figures(without.theta).items() if log in with_it}
+                harmed = max((log for log in change if log in self.tests), key=lambda log: change[log], default=None)
+                if harmed is not None and change[harmed] > HARM:
+                    self.left_out[name] = f"makes {harmed} worse: {np.exp(change[harmed]):.2f} times the error"
+                elif change and min(change.values()) > -LEAST_USE:
+                    self.left_out[name] = f"no log is better by {LEAST_USE:.0%} for it"
+                else:
+                    continue
+                self.notes.append(f"{name} fits, but is not named: {self.left_out[name]}")
+                fit = without
+                break
+            else:
+                break
+        return fit
+
+    def spared(self, fit: Fit) -> Fit:
+        """Set to zero what the model itself does not need any more: coefficients not below 0 that only stood in for
+        what was missing.
+        """
+        judge = self.judge
+        for k, p in enumerate(judge.stage.parameters if fit.effects else ()):
+            if p.low == 0.0 and p.tolerance > 0 and p.value - p.tolerance <= 0.0 and fit.theta[k] != 0.0:
+                judge.spared.add(k)
+                theta = fit.theta.copy()
+                theta[k] = 0.0
+                less = judge.fit(fit.effects, theta, 12)
+                if self.earns(less, fit):
+                    judge.spared.discard(k)
+                else:
+                    fit = less
+        return fit
+
+    def _sizes(self) -> dict[str, int]:
+        """How many numbers of each effect say how much of it there is."""
+        return {e.name: sum(not p.shape for p in e.parameters) for e in self.judge.stage.effects}
+
+    # ---- names -------------------------------------------------------------------------------------------------------
+
+    def name(self, search: Search, fit: Fit, candidates: list[Candidate]) -> tuple[list[Found], Fit]:
+        """Each effect with those that would do as well in its place, and how often it wins over resampled blocks; test
+        logs decide between rivals that the fitted ones cannot tell apart.
+        """
+        names = [e.name for e in self.judge.stage.effects if e.name not in self.left_out]
+        found = self._named(search, fit, names)
+        decided = False
+        for f in found if self.tests and self.figures is not None else ():
+            rest = tuple(e for e in fit.effects if e != f.effect)
+            for other in f.rivals:
+                trial = self.spared(search.joined((*rest, other)))
+                if self._tested(trial) < self._tested(fit) - RIVAL:
+                    self.notes.append(
+                        f"{f.effect} and {other} do equally well on the fitted log; the test logs prefer {other}"
+                    )
+                    search.fits[frozenset(trial.effects)] = trial
+                    fit, decided = trial, True
+        return (self._named(search, fit, names) if decided else found), fit
+
+    def _tested(self, fit: Fit) -> float:
+        """Mean log error on the test logs."""
+        assert self.figures is not None
+        return float(np.mean([v for log, v in self.figures(fit.theta).items() if log in self.tests] or [0.0]))
+
+    def _named(self, search: Search, fit: Fit, names: list[str]) -> list[Found]:
+        judge, stage = self.judge, self.judge.stage
+        count = int(np.sum(judge.samples > 0))
+        draws = np.random.default_rng(0).integers(0, count, (400, count))
+        size = self._sizes()
+        out = []
+        for name in fit.effects:
+            rest_names = tuple(e for e in fit.effects if e != name)
+            rest = search.joined(rest_names)
+            alternatives = {name: fit}
+            tried = search.best_of([(*rest_names, n) for n in names if n not in fit.effects])
+            holding = [n for n in names if any(held == name for held, _ in stage.effect(n).holds)]
+            for f in (*tried, *(search.joined((*rest_names, n)) for n in holding if n not in fit.effects)):
+                alternatives[next(e for e in f.effects if e not in rest_names)] = f
+            mine = score(judge, fit)
+            # what has more parameters and does no better holds the named effect within it
+            alternatives = {m: f for m, f in alternatives.items() if m == name or size[m] <= size[name]}
+            # a law that holds the named one within it is that one at some of its sizes: no log could tell them apart
+            same = [m for m in holding if m in alternatives and judge.total_of(alternatives[m]) <= judge.total_of(fit)]
+            rivals = [
+                m for m, f in alternatives.items()
+                if m != name and (m in same or (score(judge, f) < mine + RIVAL and self.earns(rest, f)))
+            ]  # fmt: skip
+            others = [f for m, f in alternatives.items() if m == name or m not in rivals]
+            wins = np.mean(np.argmin([[score(judge, f, d) for d in draws] for f in others], axis=0) == 0)
+            share = float(wins) / (1.0 + len(rivals))
+            gained = float(rest.held_out.sum() - fit.held_out.sum())
+            shares = {name: share} | dict.fromkeys(rivals, share)
+            fall = rms_of(judge, rest) / max(rms_of(judge, fit), 1e-300)
+            out.append(Found(name, share, parameters_of(stage, fit, name), rivals, gained, alternatives, shares, fall))
+        return out
+
+    def conclude(
+        self, base: Fit, fit: Fit, effects: list[Found], candidates: list[Candidate], steps: list[tuple[str, float]]
+    ) -> StageDiagnosis:
+        """Missing what was found; else unknown where the error left is more than noise, or follows from what was
+        logged; or none.
+        """
+        judge, stage = self.judge, self.judge.stage
+        left = rms_of(judge, fit)
+        unknown = left > UNKNOWN or (not agrees(left, 1.0) and structure(judge, fit) > STRUCTURE)
+        for f in effects:
+            if at_bound(stage, fit, f.effect):
+                self.notes.append(f"{f.effect} stands at the end of its physical range: the log would have it go on")
+        excess = max(rms_of(judge, base) ** 2 - 1.0, 1e-300)
+        share = max(left * left - 1.0, 0.0) / excess
+        poor = bool(effects) and left > UNKNOWN and share > MOST_LEFT
+        verdict = "missing" if effects and not poor else "unknown" if unknown or poor else "none"
+        if poor:  # no name rather than a poor one
+            out = answer_of(judge, verdict, base, base, [], steps, candidates)
+            out.nearest = list(dict.fromkeys(m for f in effects for m in (f.effect, *f.rivals)))[:3]
+            named = " + ".join(f.effect for f in effects)
+            out.refused = [f"{named} comes nearest and leaves {np.sqrt(share):.0%} of the error"]
+        else:
+            out = answer_of(judge, verdict, base, fit, effects, steps, candidates)
+        out.criterion = "error_share"
+        out.notes, out.gain = self.notes, "fall of the held-out error [%]"
+        return out
+
+
+def structure(judge: Judge, fit: Fit) -> float:
+    """Share of the remaining error that present and past inputs and outputs predict on blocks that the prediction was
+    not fitted to.
+
+    A linear regression on the logged channels, their magnitudes, signs and squares, now and at some past times. What a
+    correct model leaves is not predicted by what it was driven with.
+    """
+    stage = judge.stage
+    e = judge.errors(fit.theta[None])[0]
+    features = []
+    for name, v in stage.regimes.items():
+        if name in ("time", "log") or name in stage.outputs:
+            continue
+        v = np.where(np.isfinite(v), v, 0.0)
+        z = (v - v.mean()) / (v.std() or 1.0)
+        for lag in (0, 1, 3, 10, 30, 100):
+            if lag > len(z) // 20:
+                continue
+            w = np.concatenate([np.full(lag, z[0]), z[: len(z) - lag]])
+            features += [w, np.abs(w), w * w, np.sign(w) * np.sqrt(np.abs(w))]
+    if not features:
+        return 0.0
+    x = np.array([*features, np.ones(len(stage.t))]).T
+    block = np.repeat(np.arange(judge.n_blocks), np.diff(np.append(judge.block_start, len(stage.t))))
+    total = left = 0.0
+    for k in range(len(e)):
+        use = judge.valid[k]
+        for fold in range(4):
+            train, test = use & (block % 4 != fold), use & (block % 4 == fold)
+            if not test.any() or train.sum() < 3 * x.shape[1]:
+                continue
+            a = x[train].T @ x[train]
+            a += 1e-3 * np.diag(np.diag(a)) + 1e-9 * np.eye(len(a))
+            c = np.linalg.solve(a, x[train].T @ e[k, train])
+            total += float(np.sum(e[k, test] ** 2))
+            left += float(np.sum((e[k, test] - x[test] @ c) ** 2))
+    return max(0.0, 1.0 - left / total) if total > 0 else 0.0

@@ -1,0 +1,253 @@
+"""The formulas that a curve may be, each fitted inside the simulation in its place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import zip_longest
+
+import numpy as np
+
+from vaneloop.base.curve import FINE, POINTS
+from vaneloop.base.forms import FORMS, Form
+from vaneloop.base.side_by_side import side_by_side
+from vaneloop.identification.candidates.closed_forms import Formula, begin, text_of, values_of
+from vaneloop.identification.least_squares.problem import Judge, covariance
+from vaneloop.identification.regimes import agrees
+from vaneloop.identification.results import rms_of
+from vaneloop.identification.selection.relative_error_acceptance import FORM, score
+from vaneloop.identification.subsystem import Array, Effect, Parameter
+from vaneloop.identification.unmodelled.curve_candidates import Candidate
+from vaneloop.identification.unmodelled.fitted_candidate import Ground, Tried, at_samples, with_held_out
+from vaneloop.identification.user_models.simulation import Placed
+from vaneloop.identification.user_models.terms import runs
+
+__all__ = ["effect_of", "fitted_formulas", "goes_on", "library_name", "likely"]
+
+CLOSE = 1e-4  # share of a curve's variance below which formulas are alike
+REFITTED = 5  # formulas that are fitted in the simulation
+NEAR = 0.05  # share of the error by which a formula may be worse than the best and is still given
+POOR = 1.5  # times the error of the curve itself: a formula that is worse is not the curve
+SHAPED = 0.2  # share of a curve's variance that a formula may leave, to be fitted at all
+STRAIGHT = ("constant", "line", "straight line")
+DEGREES = ("degC", "°C", "C")
+FAR = 100.0  # times the curve's range that a formula's may be
+SAME = 0.02  # share of its spread by which a formula must differ from a simpler one to be given beside it
+MEANT = 2_000  # values of a quantity of which a formula's mean is taken
+NOTHING = 1e-200  # RMS of a formula where the logs have been, below which it says nothing there
+STEEPER = 10.0  # times the steepest slope where the logs have been: beyond, a formula runs away
+PER_NUMBER = 0.005  # log error that a number of a formula costs
+
+
+def _visited(tried: Tried) -> Array:
+    """Values of a curve's quantity, as often as the samples that are judged have them."""
+    q, counted = tried.candidate.quantity.visited, tried.judge.valid.any(axis=0)
+    judged = at_samples(q, len(counted))
+    x = q[np.isfinite(q)] if judged is None or not counted.any() else judged[counted]
+    return np.quantile(x, np.linspace(0.005, 0.995, POINTS))
+
+
+def _variance(tried: Tried, visited: Array) -> Array:
+    """Variance of a curve at values of its quantity, by the noise of what it was fitted to."""
+    c, judge, fit = tried.candidate, tried.judge, tried.fit
+    scale, own = judge.scale[fit.free], judge.stage.index()[c.name]
+    mine = np.flatnonzero((fit.free >= own.start) & (fit.free < own.stop))
+    known = covariance(fit.normals.sum(axis=0) + np.diag(fit.prior * scale**2))[np.ix_(mine, mine)]
+    known *= max(1.0, float(fit.cost.sum()) / max(judge.n, 1))
+    rows = np.array([tried.at(visited, step) for step in np.diag(scale[mine])])
+    return np.asarray(np.maximum(np.einsum("in,ij,jn->n", rows, known, rows), 0.0))
+
+
+def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[tuple[Formula, Tried]]:
+    """The formulas that come nearest to a curve, each fitted in the simulation in its place; best first.
+
+    A curve is known where the log tells it. Splines that leave more than noise are off by their smoothness, too, most
+    where a law has its corner: there formulas count as well that come near it everywhere alike.
+
+    loose  whether only the curve's bends choose them: its mean and slope may be what parameters of the model could have
+    """
+    c = tried.candidate
+    visited = _visited(tried)
+    at_visited = tried.at(visited, tried.table()[1])
+    lent = c.lent | ({0, 1} if loose else set())
+    variance, spread = _variance(tried, visited), max(float(np.var(at_visited)), 1e-300)
+    weights = [1.0 / np.sqrt(variance + CLOSE * spread)]
+    if not agrees(rms_of(tried.judge, tried.fit), 1.0):
+        weights.append(np.ones(len(visited)))
+    ranked = [_nearest(c, visited, at_visited, variance, lent, weight) for weight in weights]
+    taken = {form.name: (form, numbers) for turn in zip_longest(*ranked) for form, numbers in filter(None, turn)}
+    shaped = list(taken.values())[:REFITTED]
+    fitted = [f for f in side_by_side(lambda s: _in_simulation(ground, tried, *s), shaped, ground.shares) if f]
+    grain = tried.judge.stage.grain
+    return sorted(fitted, key=lambda f: np.log(f[0].error) / grain + PER_NUMBER * len(f[0].numbers))
+
+
+def _nearest(
+    c: Candidate, visited: Array, at_visited: Array, variance: Array, lent: set[int], weight: Array
+) -> list[tuple[Form, Array]]:
+    """Formulas that come near a curve, the nearest first, each with its numbers.
+
+    variance  of the curve at visited values; ``weight`` that each of them has; ``lent``: a mean, a slope it may have
+    """
+    middle = np.average(at_visited, weights=weight**2)
+    doubt = float(np.sum(weight**2 * variance) / max(np.sum((weight * (at_visited - middle)) ** 2), 1e-300))
+    shaped = []
+    few = len(np.unique(visited)) <= 3  # a direction: every formula is a straight line, or a constant
+    warm = c.quantity.unit in DEGREES
+    for form in FORMS:
+        if (few and form.name not in ("constant", "line")) or (not warm and form.name == "Arrhenius"):
+            continue
+        if not c.mean and form.name in ("constant", "straight line"):  # less its mean: nothing, and a line
+            continue
+        # a gain takes a line through 0, and leaves another mean than a line about the middle: only the bends tell
+        free = {*lent, 0} if 1 in lent and form.name not in STRAIGHT else lent
+        got = begin(form, visited, at_visited, free, weight)
+        if got is not None and np.ptp(form.value(visited, got[0])) > FAR * np.ptp(at_visited):
+            continue  # nearly a straight line, of which the parameters would have to take all but the bend
+        if got is not None and got[1] < SHAPED and _is_shaped(form, got[0], c):
+            shaped.append((np.log(max(got[1], doubt, CLOSE)) + 0.3 * form.complexity, form, got[0]))
+    shaped.sort(key=lambda s: s[0])
+    return [(form, numbers) for _, form, numbers in shaped]
+
+
+def likely(tried: Tried, fitted: list[tuple[Formula, Tried]], before: float) -> list[Formula]:
+    """Of formulas that were fitted those that come within `NEAR` of the best, simplest first.
+
+    before  held-out error without the curve, in noise floors: no law's form is known better than `FORM` of it
+    """
+    own, grain = rms_of(tried.judge, tried.fit), tried.judge.stage.grain
+    poor = float(np.hypot(POOR**grain * max(own, 1.0), FORM * before if grain == 1.0 else 0.0))
+    near = [f for f, _ in fitted if f.error <= poor]
+    if not near:
+        return []
+    limit = max(min(f.error for f in near), min(own, 1.0)) * (1.0 + NEAR * grain)
+    out: list[Formula] = []
+    visited = _visited(tried)
+    for f in sorted((f for f in near if f.error <= limit), key=lambda f: (f.complexity, f.error)):
+        y = values_of(f, visited)
+        simpler = [values_of(g, visited) for g in out if g.complexity < f.complexity]
+        if all(np.std(y - other) > SAME * np.std(y) for other in simpler):
+            out.append(f)
+    return out
+
+
+def _is_shaped(form: Form, numbers: Array, c: Candidate) -> bool:
+    """Whether a formula has the shape that its curve is known to have."""
+    x = c.grid
+    y, other, none = (np.broadcast_to(form.value(q, numbers), q.shape) for q in (x, -x, np.zeros(1)))
+    little = 1e-6 * float(np.max(np.abs(y)))
+    steps = np.diff(y) * (("rising" in c.shape) - ("falling" in c.shape))
+    return bool(
+        ("zero" not in c.shape or abs(none[0]) <= little)
+        and ("odd" not in c.shape or np.max(np.abs(y + other)) <= little)
+        and steps.min() >= -little
+    )
+
+
+def goes_on(ground: Ground, c: Candidate, form: Form, numbers: Array) -> tuple[float, float]:
+    """From where to where a formula stands in a curve's place: beyond the curve's range as far as the ground lets it,
+    while it is not much steeper than within.
+    """
+    low, high = ground.reach(c)
+    x = np.linspace(low, high, FINE)
+    middle = 0.5 * (x[1:] + x[:-1])
+    with np.errstate(all="ignore"):
+        slope = np.abs(np.diff(np.broadcast_to(form.value(x, numbers), x.shape)))
+    inside = c.basis.reaches(middle)
+    wild = middle[~(slope <= STEEPER * slope[inside].max(initial=0.0)) & ~inside]
+    return (
+        float(max(wild[wild < c.basis.low].max(initial=low), low)),
+        float(min(wild[wild > c.basis.high].min(initial=high), high)),
+    )
+
+
+def effect_of(name: str, names: Sequence[str], numbers: Array) -> Effect:
+    """A formula as the search has it: its numbers begin at these, and are in usual as large."""
+    size = np.maximum(np.abs(numbers), 1e-9 * np.max(np.abs(numbers)))
+    ps = tuple(Parameter(n, 0.0, "", scale=float(s)) for n, s in zip(names, size, strict=True))
+    return Effect(name, ps, (tuple(float(v) for v in numbers),))
+
+
+def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> tuple[Formula, Tried] | None:
+    """A formula in the curve's place, fitted with the model's own parameters.
+
+    Its first number is fitted as the RMS of the whole formula where the logs have been: the height of a limit is known
+    well, and its slope and its corner make up for each other.
+    """
+    c = tried.candidate
+    been = c.quantity.visited[np.isfinite(c.quantity.visited)]
+    been = been[np.linspace(0, len(been) - 1, min(len(been), MEANT)).astype(int)]
+
+    def size(inner: Array) -> float:
+        y = form.value(been, np.concatenate([[1.0], inner]))
+        return float(np.sqrt(np.mean(y * y)))
+
+    def plain(n: Array) -> Array:
+        of = size(n[1:])  # 0 where a corner has left the logs
+        return np.concatenate([[n[0] / of if of > NOTHING else 0.0], n[1:]])
+
+    reach = goes_on(ground, c, form, numbers)  # what a model says to a reading may lie beyond what the logs show of it
+    numbers = np.concatenate([[numbers[0] * size(numbers[1:])], numbers[1:]])
+    effect = effect_of(c.name, form.numbers, numbers)
+
+    def mean(n: Array) -> float:  # where a parameter that is fitted has it, the formula has none
+        if c.quantity.stops:
+            return float(form.value(c.grid[:1], n)[0])
+        return 0.0 if c.mean else float(np.mean(form.value(been, n)))
+
+    def placed(low: float, high: float) -> Placed:
+        table, jump = runs(form, low, high, ground.points)
+        jumps = None if jump is None else lambda n: jump(plain(n))
+        return c.placed_as(lambda n: table(plain(n)) - mean(plain(n)), len(numbers), (low, high), jumps)
+
+    curves = (*tried.curves[:-1], (placed(*reach), effect))
+    judge = Judge(ground.stage((), curves), ground.floor, tried.settled)
+    judge.sparing = True
+    theta = np.concatenate([tried.fit.theta[: tried.judge.stage.index()[c.name].start], numbers])
+    if not np.all(np.isfinite(judge.stage.run(theta[None]))):
+        return None
+    names = tuple(e.name for e in judge.stage.effects)
+    led = judge.lead(names[:-1], theta, 8, tried.slopes())  # first the rest of the model with the formula as it stands
+    fit = with_held_out(judge, judge.fit(names, led.theta, 12, slopes=led.slopes))
+    if not np.isfinite(score(judge, fit)):
+        return None
+    values = form.plain(plain(fit.theta[-len(numbers) :]))
+    said = dict(zip(form.numbers, (float(v) for v in values), strict=True))
+    formula = Formula(
+        form.name,
+        text_of(form, values, c.quantity.name, bool(c.basis.low >= 0.0), mean(values)),
+        said,
+        rms_of(judge, fit),
+        form.complexity,
+        library_name(c, form),
+        -mean(values),
+    )
+    further = (*tried.curves[:-1], (placed(*goes_on(ground, c, form, values)), effect))  # on test logs
+    return formula, tried.refitted(judge, fit, further)
+
+
+# forms that are laws of the library, where the curve is of what is at its own place
+OF_STATE = {
+    "constant": "offset",
+    "line": "leak",
+    "root": "square_root",
+    "signed square": "quadratic_drag",
+    "cube": "cubic",
+}
+OF_FORCE = {"constant": "force_offset", "line": "viscous", "signed square": "quadratic_drag", "sign": "coulomb"}
+OF_POSITION = {"line": "spring", "cube": "cubic_spring"}
+OF_SIGNAL = {"constant": "bias", "line": "gain", "cube": "cubic", "magnitude": "asymmetric_gain"}
+
+
+def library_name(c: Candidate, form: Form) -> str:
+    """Name of the law of the library that a form is at this place; "": none."""
+    where, own = c.how.split()[0], c.quantity.name == c.at.removesuffix("_sensor")
+    if c.how.endswith("times"):
+        return ""
+    if where == "state":
+        table = OF_STATE if own and "/s" in c.unit else OF_FORCE if own else {}
+    elif where == "force":
+        table = OF_FORCE if c.quantity.name == "velocity" else OF_POSITION if c.quantity.name == "position" else {}
+    else:
+        table = OF_SIGNAL if own else {}
+    name = table.get(form.name, "")
+    return f"{c.at}.{name}" if name else ""

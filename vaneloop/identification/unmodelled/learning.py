@@ -1,0 +1,568 @@
+"""A law that nobody listed: where it acts, of which quantity it is a function, and its curve.
+
+Every place of the model is tried with every quantity that the logs or the model know. The slopes of a curve's functions
+at the model as it is say what each could do, one linear solve a candidate; the most promising are fitted inside the
+simulation, with the model's own parameters. What earns a curve its place is what earns it for a law with a name
+(`identification.selection.relative_error_acceptance`): the error of blocks that it was not fitted to, and no harm to a
+test log. Beside laws with names it must do clearly better than the best of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from vaneloop.base.side_by_side import Answer, Item, side_by_side
+from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known
+from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.regimes import agrees
+from vaneloop.identification.results import StageDiagnosis, rms_of
+from vaneloop.identification.selection.likelihood_acceptance import correlation_of
+from vaneloop.identification.selection.relative_error_acceptance import (
+    BETTER,
+    HARM,
+    LEAST_USE,
+    MOST_LEFT,
+    PER_PARAMETER,
+    RIVAL,
+    UNKNOWN,
+    ErrorShare,
+    score,
+    worth,
+)
+from vaneloop.identification.subsystem import Array
+from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
+from vaneloop.identification.unmodelled.confirmation import another_confirms, instead_of
+from vaneloop.identification.unmodelled.curve_candidates import Candidate
+from vaneloop.identification.unmodelled.fitted_candidate import (
+    MEASURED,
+    Ground,
+    Outcome,
+    Placings,
+    Tried,
+    adds_what,
+    at_samples,
+    channel_of,
+    one_constant,
+    plain,
+    stands,
+    strange,
+    surely_more,
+    told_by_others,
+    with_held_out,
+    without_its_lag,
+)
+from vaneloop.identification.unmodelled.likelihood_acceptance import (
+    earns,
+    grain_of,
+    in_grains,
+    promises,
+    told_in_nats,
+    unconfirmed,
+)
+from vaneloop.identification.unmodelled.parametric_preference import (
+    all_in_their_place,
+    at_its_place,
+    earning_by_formula,
+    harmless,
+    leaves,
+    said_first,
+    without_memory,
+)
+from vaneloop.identification.unmodelled.parametric_substitution import tell_each_by_its_formula
+from vaneloop.identification.unmodelled.screening import SCREENED, screened, smoothed
+from vaneloop.identification.unmodelled.surface_search import put_surface
+from vaneloop.identification.user_models.bound_system import rms_of_rows
+from vaneloop.identification.user_models.exogenous_regressors import TIME
+from vaneloop.identification.user_models.hysteresis_regressors import dissipates
+
+__all__ = ["Learner"]
+
+MOST_CURVES = 2
+WIGGLES = (0.1, SCREENED, 5.0)  # standard deviations of a curve's first bend, in its usual size, that are tried
+QUICK, FINISHED = 24, 5  # candidates that are fitted for a few steps, and of these to the end
+FEW_STEPS, MANY_STEPS = 3, 12  # of the former; on an excerpt more would only suit the excerpt
+FAR_OFF = 5.0  # noise floors: a model that is further off has a crooked way to go, the more so in the right place
+SURE = 3  # of the latter that are chosen by data left out
+SLIPPING = 2  # hystereses that are, whatever data left out say: what promises most tells crank and rings hardly apart
+OVER_TIME = 2  # of these of time: with its many splines it imitates much
+PLAINER = 2  # more that are fitted to the end, where they are plainer than the best; and as many at their place itself
+NEAR = 0.25  # log error after a few steps within which another quantity may still do as well
+TIMES, STEP = (1.8, 1.3, 1.1, 1.03), 0.002  # by which a lag is changed; log error by which a change must help
+TURNS = (0.3, 0.1)  # by which a period is changed, in turns over the whole way
+FORMULAS = 0.5  # log error by which a curve may be worse than the best, and a formula or a jump still tell it better
+SPLINES = 28  # of the best finalists where they still fail
+
+
+class Learner:
+    """The search for curves on one stage.
+
+    ground    the stage on its logs
+    d         what `diagnose` says of it
+    progress  called with the share that is done
+    shape     what is known of every curve (`identification.unmodelled.curve_candidates.SHAPES`)
+    speaks    whether a formula that does as well as its curve will be the law
+    """
+
+    def __init__(
+        self, ground: Ground, d: StageDiagnosis, progress: Callable[[float], None] | None = None,
+        shape: Sequence[str] = (), speaks: bool = True,
+    ):  # fmt: skip
+        self.ground, self.d, self.progress, self.shape = ground, d, progress or (lambda _: None), tuple(shape)
+        self.speaks = speaks
+        self.ranked: list[list[Tried]] = []  # of each search for a curve, what was fitted, best first
+        self.judge = self._judge((), ())
+        self.base = self.judge.fit((), d.base.theta[: len(self.judge.stage.parameters)], 4)
+        self.form = ErrorShare(self.judge)
+        self.form.begin(self.base)
+        self.faint = ground.noise_known and not self.form.fails(self.base)
+        if self.faint:
+            in_grains(ground, grain_of(self.judge, self.base), [self.judge])
+        self.candidates = [s for c in ground.candidates(self.base.theta) if (s := c.shaped(shape)) is not None]
+
+    def _judge(
+        self, laws: Sequence[str], curves: Placings, quick: bool = False, keep: Array | None = None
+    ) -> Judge:  # fmt: skip
+        return Judge(self.ground.stage(laws, curves, quick), self.ground.floor, keep)
+
+    def fails(self, tried: Tried) -> bool:
+        """Whether there is any error beyond noise where it is judged."""
+        return ErrorShare(tried.judge).fails(tried.fit)
+
+    def each(self, f: Callable[[Item], Answer], items: Iterable[Item]) -> Iterator[Answer]:
+        """`side_by_side` where the ground's models allow it."""
+        return side_by_side(f, items, self.ground.shares)
+
+    def learned(self) -> Outcome:
+        """Curves one after the other, each earning its place; at most two."""
+        out = Outcome("none")
+        unknown = self.d.verdict == "unknown"  # the diagnosis says that something is missing: so it is
+        if not (unknown or self.faint or self.form.fails(self.base)):
+            out.why = "the model comes down to the noise of its samples: nothing is missing"
+            return out
+        named = self._named()
+        if named is not None and self.d.effects and agrees(rms_of(*named), 1.0):
+            out.verdict = "named"
+            out.why = f"{' + '.join(self.d.final.effects)} of the library leaves nothing but noise"
+            return out
+        current = Tried(self.candidates[0], 0.0, self.judge, self.base, ()) if self.candidates else None
+        while current is not None and len(out.tried) < MOST_CURVES:
+            if not self.fails(current) and (out.tried or not (unknown or self.faint)):
+                break
+            finalists = self._finalists(current)
+            out.nearest = out.nearest or [t.candidate.name for t in finalists[:3]]
+            good = [t for t in finalists if self._earns(current, t)]
+            poor = [t for t in finalists if t not in good]
+            only_said = earning_by_formula(self, current, poor, finalists) if self.speaks else []
+            good += only_said
+            if not good:
+                break
+            left = {t.candidate.name: self._left(current, t, good) for t in good}
+            self._with_formulas(current, good, left)
+            good = harmless(self, current, good, left)
+            good = without_memory(self, current, good)
+            self._tell_apart(good, left)
+            near = said_first(self, self._near(current, good, left), left)
+            best, harms = None, []
+            for chosen in (t for t in near if another_confirms(self, current, t)):  # what harms makes way for the next
+                last, why = self._as_learned(current, chosen)
+                if not why:
+                    best = last
+                    break
+                harms.append(f"{last.candidate.name} fits, but is not learned: {why}")
+            if best is None:
+                forgets = (
+                    f"{near[0].candidate.name} fits, but is not learned: it remembers, and neither another log nor "
+                    f"another amplitude confirms it"
+                )
+                out.notes += harms[:1] or [forgets]
+                break
+            limit = left[chosen.candidate.name] + RIVAL
+            rivals = [t.candidate.name for t in good if t is not chosen and left[t.candidate.name] < limit]
+            current = replace(best, rivals=rivals)
+            out.tried.append(current)
+            # what splines do not follow is no second law where a formula does
+            done = any(not self.fails(f) for _, f in current.formulas or ())
+            if done or best.candidate.name in [t.candidate.name for t in only_said]:
+                break
+        if len(out.tried) > 1:
+            self._spare_first(out)
+        if len(out.tried) > 1:
+            tell_each_by_its_formula(self, *out.tried)
+        put_surface(self, out)
+        return self._concluded(out, named)
+
+    def _as_learned(self, current: Tried, tried: Tried) -> tuple[Tried, str]:
+        """A curve with the lag that suits it best, and without what parameters of the model can have; and why it is not
+        learned, "" if it is: it harms a test log, and no formula that does as well is harmless.
+        """
+        best = self._settled(current, self._with_its_lag(current, tried, TIMES[1:]))
+        why = self._harmful(current, best)
+        if why or self.fails(best):
+            best.formulas = fitted_formulas(self.ground, best)
+        for _, f in best.formulas or () if why and self.speaks else ():
+            if not self._harmful(current, f) and self._score(f, [f, best]) <= self._score(best, [f, best]) + RIVAL:
+                why = ""
+        return best, why
+
+    def _spare_first(self, out: Outcome) -> None:
+        """Take out a first curve that only stood for what the second one is."""
+        first, second = out.tried
+        own = second.judge.stage.index()
+        gone = {*range(own[first.candidate.name].start, own[first.candidate.name].stop)}
+        theta = np.array([v for k, v in enumerate(second.fit.theta) if k not in gone])
+        nothing = Tried(second.candidate, 0.0, self.judge, self.base, ())
+        alone = self._fitted(nothing, second.candidate, second.wiggle, theta, 16)
+        if self._score(alone, [alone, first]) <= self._score(second, [alone, first]) + BETTER:
+            out.tried = [replace(alone, told=second.told, rivals=second.rivals)]
+
+    def _named(self) -> tuple[Judge, Fit] | None:
+        """The best laws of the library, fitted with their held-out errors, where there are any."""
+        effects = self.d.final.effects or tuple(self.d.nearest[:1])
+        if not effects:
+            return None
+        judge = self._judge(effects, ())
+        theta = judge.stage.neutral()
+        whole, part = self.ground.whole.index(), judge.stage.index()
+        theta[: len(self.base.theta)] = self.d.final.theta[: len(self.base.theta)]
+        for e in effects:
+            if self.d.final.effects:
+                theta[part[e]] = self.d.final.theta[whole[e]]
+            else:
+                theta[part[e]] = self.ground.whole.effect(e).starts[0]
+        return judge, judge.fit(effects, theta, 8)
+
+    def _concluded(self, out: Outcome, named: tuple[Judge, Fit] | None) -> Outcome:
+        if not out.tried:
+            out.verdict = "named" if self.d.effects else "unknown"
+            out.why = (
+                "no function of one or two quantities, at any place, explains enough of the error on data left out"
+            )
+            return out
+        last = out.tried[-1]
+        left, was = leaves(last), rms_of(self.judge, self.base)
+        share = max(left**2 - 1.0, 0.0) / max(was**2 - 1.0, 1e-300)
+        if left > UNKNOWN and share > MOST_LEFT:
+            out.verdict, out.why = "unknown", f"the best curve leaves {np.sqrt(share):.0%} of the error"
+        elif named and self.d.effects and not instead_of(self, self._as_tried(last.candidate, *named), out.tried):
+            out.verdict = "named"
+            out.why = f"{' + '.join(self.d.final.effects)} of the library does as well, or nearly"
+        else:
+            out.verdict = "learned"
+        return out
+
+    def _as_tried(self, candidate: Candidate, judge: Judge, fit: Fit) -> Tried:
+        """The laws of the library, to hold a candidate against them."""
+        return Tried(candidate, 0.0, judge, fit, (), errors=self.ground.errors((), fit.theta, fit.effects))
+
+    def _known(self, among: Sequence[Tried]) -> Array:
+        """Samples where all these curves are told by more than one block."""
+        start, n = self.judge.block_start, len(self.judge.stage.t)
+        known = np.ones(n, dtype=bool)
+        for q in {q.name: q for t in among for q, _ in t.candidate.axes}.values():
+            if (values := at_samples(q.visited, n)) is not None:
+                known &= told_by_others(values, start)
+        for settled in (t.settled for t in among):
+            known &= True if settled is None else settled
+        return known if known.any() else ~known
+
+    def _judged(self, tried: Tried, among: Sequence[Tried]) -> tuple[Judge, Fit]:
+        """A fit with its held-out errors, where all curves of ``among`` know something."""
+        known = self._known(among)
+        if known.all():
+            return self.judge, tried.fit
+        judge = Judge(self.judge.stage, self.ground.floor, keep=known)
+        return judge, with_held_out(tried.judge, tried.fit, tried.counted(known))
+
+    def _score(self, tried: Tried, among: Sequence[Tried] = ()) -> float:
+        """What orders curves: `score`, where all of ``among`` (default: itself) know something."""
+        return score(*self._judged(tried, among or [tried]))
+
+    def _worth(self, before: Tried, tried: Tried) -> bool:
+        """Whether a curve earns its place, where it knows something and what it is held against does."""
+        among = [tried, before] if before.curves else [tried]
+        (judge, was), (_, now) = (self._judged(t, among) for t in (before, tried))
+        if self.faint:
+            return earns(judge, was, now, correlation_of(tried.judge, tried.fit))
+        return worth(judge, was, now, self.form.form).good
+
+    def _earns(self, before: Tried, tried: Tried) -> bool:
+        c = tried.candidate
+        if c.quantity.stops:
+            table, amplitudes = tried.table()
+            if not dissipates(c.basis.low, c.basis.high, table(amplitudes)):
+                return False
+        return self._worth(before, tried)
+
+    def _left(self, before: Tried, tried: Tried, among: Sequence[Tried]) -> float:
+        """What orders candidates ``among`` which one is chosen: the score and what each makes of the test logs."""
+        return self._score(tried, among) + self._tested(before, tried, among)
+
+    def _tested(self, before: Tried, tried: Tried, among: Sequence[Tried]) -> float:
+        """Log of what a curve makes of the test logs' error, where all of ``among`` know something."""
+        inside = [self.ground.within(t.candidate) for t in among]
+        part = {log: np.logical_and.reduce([i[log] for i in inside if log in i]) for i in inside for log in i}
+        change = self._change(before, tried, part)
+        tests = [c for log, c in change.items() if log in self.ground.tests]
+        return float(np.mean(tests)) if tests else 0.0
+
+    def _with_formulas(self, before: Tried, good: Sequence[Tried], left: dict[str, float]) -> None:
+        """Where the best curve still fails, or harms a test log, what each may leave with a formula in its place, else
+        those of a plainer quantity: a corner or a jump is none for splines, and beyond what other blocks tell them they
+        go astray. Where one of those is then before the best, all have theirs. Every formula counts as many numbers as
+        the sparest of these curves, however many its own has.
+        """
+        best = min(good, key=lambda t: left[t.candidate.name])
+        costs = [left, {t.candidate.name: 0.5 * float(np.log(t.fit.cost.sum() / t.judge.n)) for t in good}]
+        close = [t for t in good if any(c[t.candidate.name] <= c[best.candidate.name] + FORMULAS for c in costs)]
+        close += [t for t in at_its_place(before, good) if t not in close]
+        first = close
+        if not (self.fails(best) or self._harmful(before, best)):
+            first = [t for t in close if strange(t.candidate) < strange(best.candidate)]
+        sparest, least = min(len(t.fit.free) for t in (*close, best)), left[best.candidate.name]
+        for some in (first, [t for t in close if t not in first]):
+            all_in_their_place(self.ground, some)
+            for t in some:
+                name = t.candidate.name
+                for f in t.loose or ():
+                    spared = PER_PARAMETER * (sparest - len(f.fit.free))
+                    left[name] = min(left[name], self._left(before, f, good) + max(spared, 0.0))
+            if min((left[t.candidate.name] for t in first), default=least) >= least:
+                break
+
+    def _tell_apart(self, good: Sequence[Tried], left: dict[str, float]) -> None:
+        """Put those behind that are surely worse, block by block, than the best of what neither remembers nor drifts,
+        where that leaves nothing but noise: at the noise a wrong channel that goes together with the right one leaves
+        little more.
+        """
+        plain_ones = [t for t in good if strange(t.candidate) <= MEASURED and not self._echoes(t.candidate)]
+        best = min(plain_ones, key=lambda t: left[t.candidate.name], default=None)
+        if best is None or self.fails(best):
+            return
+        for t in plain_ones:
+            (_, worse), (_, fit) = (self._judged(one, [t, best]) for one in (t, best))
+            if surely_more((worse.held_out - fit.held_out)[self.judge.samples > 0]):
+                left[t.candidate.name] = max(left[t.candidate.name], left[best.candidate.name] + 2.0 * RIVAL)
+
+    def _echoes(self, candidate: Candidate) -> bool:
+        """Whether a curve is of what the stage itself gives elsewhere, as measured: with that goes its noise, and a
+        little of that off the error.
+        """
+        return channel_of(candidate) in self.ground.measured and strange(candidate) > 0
+
+    def _preferred(self, tried: Tried, left: float) -> tuple[float, ...]:
+        """What orders candidates that do as well: the plainer first; of equally plain ones that which leaves less, and
+        where the held-out error is noise, less in all.
+        """
+        return *plain(tried.candidate), round(left, 2), rms_of(tried.judge, tried.fit)
+
+    def _near(self, before: Tried, good: list[Tried], left: Mapping[str, float]) -> list[Tried]:
+        """The candidates that do as well as the best, plainest first; ``good`` is put in order."""
+        good.sort(key=lambda t: left[t.candidate.name])
+        near = [t for t in good if left[t.candidate.name] < left[good[0].candidate.name] + RIVAL]
+        plainer = [t for t in good if t not in near and self._plainer(before, t, good[0])]
+        limit = max((left[t.candidate.name] for t in plainer), default=-np.inf) + RIVAL  # as good as one of those
+        alike = [t for t in good if t not in near and adds_what(t.candidate, good[0].candidate)]
+        near += [t for t in alike if t in plainer or left[t.candidate.name] < limit]
+        return sorted(near, key=lambda t: self._preferred(t, left[t.candidate.name]))
+
+    def _plainer(self, before: Tried, tried: Tried, best: Tried) -> bool:
+        """Whether a curve adds what the best one makes of a parameter, of the same quantity, and that does not earn its
+        place before it: a damping times a function of the speed is a force that is one of the speed.
+        """
+        if not adds_what(tried.candidate, best.candidate):
+            return False
+        if self._worth(tried, best):
+            return False
+        mine, its = (self._tested(before, t, [tried, best]) for t in (tried, best))
+        return mine < its + HARM
+
+    def _with_its_lag(self, current: Tried, best: Tried, steps: Sequence[float]) -> Tried:
+        """The curve with the lag that suits it best, by such ``steps`` up and down; or with the period."""
+        q = best.candidate.quantity
+        if q.period:  # by so many turns over the whole way
+            steps = [1.0 + turns * q.period / q.span for turns in TURNS]
+        for times in steps if q.slower is not None else ():
+            for factor in (times, 1.0 / times):
+                while (more := self._slower(current, best, factor)) is not None:
+                    best = more
+        return best
+
+    def _slower(self, current: Tried, best: Tried, times: float) -> Tried | None:
+        """The curve with a lag so many times as long; None where that is no better."""
+        if (slower := best.candidate.slower(times)) is None or stands(current, slower):
+            return None
+        more = self._fitted(current, slower, best.wiggle, self._begun(best, slower), 12, slopes=best.slopes())
+        (judge, now), (_, was) = (self._judged(t, [more, best]) for t in (more, best))
+        worse = score(judge, now) - score(judge, was)
+        # within the noise the score does not tell: what is left there still does
+        falls = 0.5 * float(np.log(was.held_out.sum() / now.held_out.sum()))
+        return more if worse < -STEP or (worse < STEP and falls > STEP) else None
+
+    def _begun(self, tried: Tried, candidate: Candidate) -> Array:
+        """Parameters from which a candidate begins that is nearly what has been fitted."""
+        c, theta = tried.candidate, tried.fit.theta
+        if candidate.splines == c.splines and candidate.parts == c.parts:
+            return theta
+        own = tried.judge.stage.index()[c.name]
+        return np.concatenate([theta[: own.start], candidate.as_of(c, theta[own])])
+
+    def _settled(self, current: Tried, best: Tried) -> Tried:
+        """The curve without mean, without slope, or without both, where the logs do not tell them from the model's own
+        parameters.
+
+        Along such a valley a fit ends anywhere; here it ends where the parameters say all that they can.
+        """
+        whole = best.candidate
+        found = dict(zip(whole.parts, best.fit.theta[best.judge.stage.index()[whole.name]], strict=True))
+        nominal, near = [current.fit.theta, best.fit.theta[: len(current.fit.theta)]], best.slopes()
+        for untold in ((0, 1), (1,), (0,)) if whole.basis.straight == 2 else ((0,),):
+            c = replace(whole, untold=untold)
+            if len(c.kept) == len(whole.kept) or not c.kept:
+                continue
+            bends = [found[k] for k in c.parts]
+            with told_in_nats(self, best):
+                fits = [self._fitted(current, c, best.wiggle, np.append(n, bends), 16, False, near) for n in nominal]
+                simpler = min(fits, key=self._score)
+                as_well = self._score(simpler) <= self._score(best) + BETTER
+            if as_well:
+                simpler.judge.stage.grain = best.judge.stage.grain
+                return replace(simpler, told=best.fit)
+        return best
+
+    # ---- candidates --------------------------------------------------------------------------------------------------
+
+    def _finalists(self, current: Tried) -> list[Tried]:
+        """The candidates that promise most, fitted; best first."""
+        near, (bare, promising) = current.slopes(beside=False), screened(self, current, QUICK, TIMES[0])
+        quick: list[Tried] = []
+        if self.faint and not (promising and promises(bare, promising[0][0])):
+            return []
+        steps = MANY_STEPS if not self.ground.noise_known and bare > FAR_OFF**2 * self.judge.n else FEW_STEPS
+        few = lambda p: self._fitted(current, p[1], SCREENED, p[2], steps, True, near)  # noqa: E731
+        for k, t in enumerate(self.each(few, promising)):
+            quick.append(t)
+            self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
+        short = len(quick[0].judge.stage.t) < len(self.judge.stage.t) if quick else False
+        if short and not all(self.fails(t) for t in quick):  # where an excerpt does not tell them apart, all samples do
+            quick = [self._fitted(current, t.candidate, SCREENED, t.fit.theta, 1) for t in quick]
+        quick.sort(key=lambda t: score(t.judge, t.fit))
+        self.ranked.append(list(quick))
+        quick, done = one_constant(quick), []
+        over_time = [t for t in quick if t.candidate.quantity.name == TIME][OVER_TIME:]
+        quick = [t for t in quick if t not in over_time]
+        # of what varies slowly a block that is left out says little at one smoothness: some go on by how well they fit
+        first, others = quick[:SURE], quick[SURE:]
+        others.sort(key=lambda t: float(t.fit.cost.sum()))
+        chosen = [*first, *others[: FINISHED - SURE]]
+        # a short excerpt has too few turns for what slips: the hystereses that promised most go on, too
+        slipping = [c.name for _, c, _ in promising if c.quantity.stops][:SLIPPING]
+        chosen += [t for t in quick if t.candidate.name in slipping and t not in chosen]
+        for k, t in enumerate(self.each(lambda t: self._finished(current, t), chosen)):
+            done.append(t)
+            self.progress((QUICK + k + 1.0) / (QUICK + len(chosen) + 1.0))
+        if self.faint and done:
+            nearest = min(done, key=lambda t: rms_of(t.judge, t.fit))
+            grain = grain_of(nearest.judge, nearest.fit)
+            in_grains(self.ground, grain, [self.judge, *(t.judge for t in (*quick, *done))])
+        done = self._ordered(done)
+        if done:  # what is plainer may say the same
+            leader, have = done[0].candidate, {t.candidate.name for t in done}
+            reach = min(score(t.judge, t.fit) for t in quick) + NEAR
+            plainer = [t for t in quick if t.candidate.name not in have and plain(t.candidate) < plain(leader)]
+            alike = {t.candidate.name for t in plainer if channel_of(t.candidate) == channel_of(leader)}
+            home = sorted(at_its_place(current, plainer), key=lambda t: float(t.fit.cost.sum()))[:PLAINER]
+            plainer = [t for t in plainer if t.candidate.name in alike or score(t.judge, t.fit) < reach]
+            plainer.sort(key=lambda t: (t.candidate.name not in alike, t.candidate.at != leader.at))
+            more = dict.fromkeys([*plainer[:PLAINER], *home])
+            done = self._ordered([*done, *self.each(lambda t: self._finished(current, t), more)])
+        if done and self.fails(done[0]):  # a curve may turn more often than its splines
+            best = self._score(done[0], done)
+            close = [t for t in done if self._score(t, done) < best + NEAR or without_its_lag(t, done[0])]
+            more_splines = zip(close, self.each(lambda t: self._finer(current, t), close), strict=True)
+            finer = {t: f for t, f in more_splines if f is not None}
+            home = at_its_place(current, done)
+            close = [t for t in done if t in home or self._score(t, done) < best + FORMULAS]
+            jumping = [j for j in self.each(lambda t: self._jumping(current, t), close) if j is not None]
+            coarse = [t for t in done if t in finer and self._worth(t, finer[t])]  # a second law would patch them
+            done = self._ordered([*(t for t in done if t not in coarse), *finer.values(), *jumping])
+            first_of = {t.candidate.name: t for t in reversed(done)}
+            done = [t for t in done if first_of[t.candidate.name] is t]
+        return done
+
+    def _ordered(self, tried: Sequence[Tried]) -> list[Tried]:
+        """The best first."""
+        return sorted(tried, key=lambda t: self._score(t, tried))
+
+    def _finished(self, current: Tried, quick: Tried) -> Tried:
+        """A candidate fitted to the end, as smooth and with the lag that suits it best."""
+        begin = quick.fit if len(quick.judge.stage.t) == len(self.judge.stage.t) else quick.fit.theta
+        done = smoothed(self, current, quick.candidate, begin, WIGGLES)
+        # what was before the log is no matter of the curve; of own models laws with names remember it as well
+        if self.ground.noise_known and (settled := done.forgotten()) is not None:
+            done = smoothed(self, current, replace(done.candidate, settled=settled), done.fit, WIGGLES, done.wiggle)
+        return self._with_its_lag(current, done, TIMES[:1])
+
+    def _finer(self, current: Tried, coarse: Tried) -> Tried | None:
+        """The same curve with `SPLINES` splines."""
+        if (fine := coarse.candidate.finer(SPLINES)) is None:
+            return None
+        return self._fitted(current, fine, WIGGLES[-1], self._begun(coarse, fine), 12, slopes=coarse.slopes())
+
+    def _jumping(self, current: Tried, smooth: Tried) -> Tried | None:
+        """The same curve with a jump where its quantity is 0."""
+        c = smooth.candidate.jumping() if self.ground.jumps else None
+        if c is None:
+            return None
+        begun = replace(smooth.fit, theta=np.append(smooth.fit.theta, 0.0))
+        return self._finished(current, replace(smooth, candidate=c, fit=begun))
+
+    def _fitted(
+        self, current: Tried, candidate: Candidate, wiggle: float, begin: Array | Fit, iterations: int,
+        quick: bool = False, slopes: Known = NOT_KNOWN,
+    ) -> Tried:  # fmt: skip
+        """A candidate fitted beside the model and its curves; ``begin``: parameters, or its fit as smooth as another
+        ``wiggle`` makes it, on the same samples; ``slopes`` near there, as far as they are known.
+        """
+        curves: Placings = (*current.curves, (candidate.placed(), candidate.effect(wiggle)))
+        settled = [s for s in (current.settled, candidate.settled) if s is not None and not quick]
+        judge = self._judge((), curves, quick, np.logical_and.reduce(settled) if settled else None)
+        judge.sparing = True
+        names = tuple(e.name for _, e in curves)
+        fit = with_held_out(judge, judge.fit(names, begin, iterations, slopes=slopes))
+        return Tried(candidate, wiggle, judge, fit, curves)
+
+    # ---- other logs --------------------------------------------------------------------------------------------------
+
+    def _harmful(self, before: Tried, tried: Tried) -> str:
+        """Why the logs speak against a curve; "": they do not."""
+        change = self._change(before, tried)
+        if self.faint and (why := unconfirmed(before.errors or {}, tried.errors or {}, self.ground.tests)):
+            return why
+        worst = max((log for log in change if log in self.ground.tests), key=lambda log: change[log], default=None)
+        if worst is not None and change[worst] > HARM:
+            return f"makes {worst} worse: {np.exp(change[worst]):.2f} times the error"
+        if change and min(change.values()) > -LEAST_USE:
+            return f"no log is better by {LEAST_USE:.0%} for it"
+        return ""
+
+    def _change(self, before: Tried, tried: Tried, part: Mapping[str, Array] | None = None) -> dict[str, float]:
+        """Log of the error with a curve over that without, log by log; ``part``: of these logs, of these samples."""
+        was, now = self._levels(before, part or {}), self._levels(tried, part or {})
+        return {log: now[log] - was[log] for log in was if log in now}
+
+    def _levels(self, of: Tried, part: Mapping[str, Array]) -> dict[str, float]:
+        if of.errors is None:
+            of.errors = self.ground.errors(of.curves, of.fit.theta)
+        out = {}
+        for log, e in of.errors.items():
+            some = e[:, part[log]] if log in part else e
+            if self.faint:
+                out[log] = 0.5 * float(np.log(np.nanmean(some**2))) / self.judge.stage.grain
+                continue
+            rms = rms_of_rows(some)
+            if np.isfinite(rms).all():
+                out[log] = float(np.log(np.maximum(rms, 1.0)).mean())
+        return out

@@ -1,0 +1,186 @@
+"""A learned law as a Python file: its formula, or its curve as a table, with units, range, and a test of its own.
+
+On a user's own model it is a `vaneloop.Law`, for the ``laws`` of the `System`; there a law may be a function of the
+signal or state that it acts on, of a displacement, or of time. Of a difference of two, which no such law is given, it
+is functions for the model itself. Of the vane chain it is the function alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vaneloop.base.errors import InputError
+from vaneloop.base.forms import FORMS
+from vaneloop.identification.user_models.exogenous_regressors import TIME, sides_of
+
+if TYPE_CHECKING:
+    from vaneloop.identification.unmodelled.learned_law import LearnedLaw
+    from vaneloop.identification.user_models.system import System
+
+__all__ = ["python_law"]
+
+POINTS = 33  # of a table
+HELD = 9  # values that the file's test holds
+
+FILE = '''"""{sentence}
+
+Equation::
+
+    curve = {equation}
+
+Symbols: q is {of} ({of_unit}); the curve is in {unit}.
+Range: learned for q in [{been}]{goes}; beyond, it stays as at the ends.
+Error on held-out data: {before:.3g} noise floors without it, {after:.3g} with it.
+"""
+
+import math
+{imports}
+{constants}
+
+def curve(q):
+    """The curve at ``q``."""
+    q = {within}
+    return {code}
+
+{law}
+def test_curve():
+    """The curve is what was learned."""
+    for q, y in {held}:
+        assert math.isclose(curve(q), y, rel_tol=1e-6, abs_tol=1e-9)
+{test}'''
+
+OWN_LAW = '''
+def {function}({arguments}):
+    """What the law gives, ``p.scale`` times as much as was learned."""
+    return {gives}
+
+
+LAW = Law(
+    "{name}",
+    "{on}",
+    {function},
+    parameters=[Parameter("scale", 0.0, "-", low=-3.0, high=3.0)],
+    starts=[1.0],
+    places=["{place}"],
+)
+
+'''
+
+OF_DIFFERENCE = '''
+def quantity(x, u):
+    """What it is a function of: a difference that no law of its own is given, so that the model calls both functions.
+
+    With c = curve(quantity(x, u)), {use}.
+    """
+    return {one} - {other}
+
+'''
+USES = {
+    "parameter times": "p.{at} * (1.0 + c) stands in the place of p.{at}",
+    "input adds": "u.{at} + c stands in the place of u.{at}",
+    "input times": "u.{at} * (1.0 + c) stands in the place of u.{at}",
+    "state adds": "{c} is taken off the derivative of {at}",
+    "output adds": "c is added to what the output {at} gives",
+    "output times": "the output {at} gives 1.0 + c times as much",
+}
+
+OWN_TEST = '''
+
+def test_law():
+    """At its neutral value it changes nothing."""
+    p = type("P", (), {{"scale": 0.0}})
+    assert {function}({some}) == {nothing}
+'''
+
+
+def python_law(law: LearnedLaw, system: System | None = None) -> str:
+    """The text of the file; ``system``: the user's own model, else the vane chain.
+
+    Raises InputError where a `Law` cannot say it: where it is a function of another channel, or multiplies a parameter.
+    """
+    low, high = law.reach if law.spoken else (float(law.x[0]), float(law.x[-1]))
+    code, constants, equation = _code(law)
+    curve: dict[str, object] = {}
+    exec(f"import math\n{constants}\ndef curve(q):\n    return {code}", curve)  # our own text
+    parts = _own_law(law, system) if system is not None else {"imports": "", "law": "", "test": ""}
+    sentence = law.sentence().rstrip(".")
+    been = f"{law.x[0]:.6g}, {law.x[-1]:.6g}"
+    period = law.period
+    along = period > 0.0 and law.channel != TIME  # what the file is given is the whole way, not that within a period
+    within = f"q % {period!r}" if along else f"min(max(q, {low!r}), {high!r})"
+    of = f"{law.channel}, of which each {period:.6g} {law.of_unit.strip('-')} are alike" if along else law.of
+    places = np.linspace(low, high, HELD, endpoint=not along)
+    held = [(float(q), float(curve["curve"](q))) for q in places]  # type: ignore[operator]
+    goes = f", and goes on to [{low:.6g}, {high:.6g}]" if law.spoken else ""
+    return FILE.format(
+        sentence=f"{sentence[0].upper()}{sentence[1:]}.", equation=equation, of=of, of_unit=law.of_unit or "-",
+        unit=law.unit or "-", low=low, high=high, been=been, goes=goes, before=law.error_before, after=law.error_after,
+        code=code, constants=constants, held=held, within=within, **parts,
+    )  # fmt: skip
+
+
+def _code(law: LearnedLaw) -> tuple[str, str, str]:
+    """The curve as an expression of q, its constants, and the equation in words."""
+    if f := law.spoken or (law.formulas[0] if law.formulas else None):
+        form = next(g for g in FORMS if g.name == f.form)
+        constants = "".join(f"{k.upper()} = {v!r}\n" for k, v in f.numbers.items())
+        code, level = form.code, f.level
+        for k in f.numbers:
+            code = code.replace(f"{{{k}}}", k.upper())
+        if level:
+            constants += f"LEVEL = {level!r}  # the model's own parameter has the mean\n"
+            code = f"{code} + LEVEL"
+        return code, constants, f.text.replace(law.of, "q")
+    places = np.linspace(0, len(law.x) - 1, POINTS).astype(int)
+    x, y = (tuple(float(f"{v:.9g}") for v in a[places]) for a in (law.x, law.y))
+    step = (x[-1] - x[0]) / (POINTS - 1)
+    constants = f"Y = {y!r}\n"
+    at = f"min(int((q - {x[0]!r}) / {step!r}), {POINTS - 2})"
+    code = f"Y[{at}] + (Y[{at} + 1] - Y[{at}]) * ((q - {x[0]!r}) / {step!r} - {at})"
+    return code, constants, f"a table of {POINTS} points, straight between them (no formula fits it)"
+
+
+def _own_law(law: LearnedLaw, system: System) -> Mapping[str, str]:
+    """The parts of the file that make it a `Law`, or functions for the model."""
+    if (sides := _sides(law, system)) is not None:
+        c = f"c / p.{system.masses[law.at]}" if law.at in system.masses else "c"
+        one, other = sides
+        use = USES[law.how].format(at=law.at, c=c)
+        return {"imports": "", "law": OF_DIFFERENCE.format(use=use, one=one, other=other), "test": ""}
+    own = law.at.removesuffix("_sensor")
+    name = law.name.rpartition(".")[2]
+    on = {"input adds": "signal", "output adds": "signal", "state adds": "state", "force adds": "force"}.get(law.how)
+    if on == "state" and law.at in system.rates:
+        on = "force"
+    way = "position" if law.how == "force adds" else system.rates.get(law.at, "")
+    speed = "velocity" if law.how == "force adds" else law.at
+    of = {
+        "signal": {own: "u"}, "state": {own: "x"}, "force": {speed: "v", **({way: "x"} if way else {})},
+    }.get(on or "", {}).get(law.channel)  # fmt: skip
+    if on is None or of is None:
+        raise InputError(
+            f"--python: {law.name} is a function of {law.of} at {law.at}; a Law of your own can be one of the signal, "
+            f"state or motion that it acts on. --out writes this one"
+        )
+    arguments = {"signal": "u, t, p", "state": "x, t, p", "force": "v, x, t, p"}[on]
+    does = f"p.scale * curve({of})"
+    some = {"signal": "1.5, 0.0, p", "state": "1.5, 0.0, p", "force": "1.5, 0.5, 0.0, p"}[on]
+    parts = {
+        "function": "acts", "arguments": arguments, "gives": f"u + {does}" if on == "signal" else does, "name": name,
+        "on": on, "place": law.at, "some": some, "nothing": "1.5" if on == "signal" else "0.0",
+    }  # fmt: skip
+    return {
+        "imports": "\nfrom vaneloop import Law, Parameter\n", "law": OWN_LAW.format(**parts),
+        "test": OWN_TEST.format(**parts),
+    }  # fmt: skip
+
+
+def _sides(law: LearnedLaw, system: System) -> tuple[str, str] | None:
+    """Of a law of a difference of what the model is called with, both as the model has them; None: it is another."""
+    drives = system.commands if system.kind == "closed_loop" else system.inputs
+    known = {**{n: f"u.{n}" for n in drives}, **{n: f"x.{n}" for n in system.states}}
+    sides = sides_of(law.of, known) if system.states and law.how in USES else None
+    return None if sides is None else (known[sides[0]], known[sides[1]])

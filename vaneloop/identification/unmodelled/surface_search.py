@@ -1,0 +1,153 @@
+"""The search for a surface: a function of two quantities, where one curve fails, and two.
+
+It must earn its place over what is there by then, as a second curve must over the first, and over every sum of two
+curves at one place: where two quantities do not act together, there is no surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations, zip_longest
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vaneloop.identification.results import rms_of
+from vaneloop.identification.selection.relative_error_acceptance import RIVAL, UNKNOWN, score
+from vaneloop.identification.subsystem import Array
+from vaneloop.identification.unmodelled.fitted_candidate import Outcome, Tried, plain, strange
+from vaneloop.identification.unmodelled.screening import SCREENED, smoothed
+from vaneloop.identification.unmodelled.surface_candidates import SPLINES, SurfaceCandidate, may_be_of, surface_of
+from vaneloop.identification.unmodelled.surface_closed_forms import fitted_products
+
+if TYPE_CHECKING:
+    from vaneloop.identification.unmodelled.learning import Learner
+
+__all__ = ["put_surface"]
+
+QUANTITIES = 5  # of which pairs are made
+TRIED, QUICK, FINISHED = 48, 10, 4  # surfaces that are fitted for one step, for a few, to the end
+FINE = SPLINES + 1  # splines each way where the best still fails
+WIGGLES = (0.03, 0.1, 0.3, SCREENED, 5.0)  # as of curves, in smaller steps
+NEAR = 0.25  # log error within which another surface may still do as well with more splines
+
+
+def put_surface(learner: Learner, out: Outcome) -> None:
+    """Put a surface in the place of the curves that were learned, where these leave clearly more than noise and it
+    earns that.
+    """
+    last = out.tried[-1] if out.tried else None
+    before = (last.judge, last.fit) if last else (learner.judge, learner.base)
+    if not learner.ground.surfaces or learner.shape or not learner.ranked or rms_of(*before) <= UNKNOWN:
+        return
+    if last and any(not learner.fails(f) for _, f in last.formulas or ()):
+        return
+    nothing = Tried(learner.candidates[0], 0.0, learner.judge, learner.base, ())
+    done = _finished(learner, nothing)
+    sums = list(learner.each(lambda t: _sum(learner, nothing, t), done))
+    others = [nothing, *([last] if last else []), *sums]
+    good = [t for t in done if all(learner._worth(other, t) for other in others)]
+    if not good:
+        return
+    left = {t.candidate.name: learner._left(nothing, t, good) for t in good}
+    for t in good:
+        t.formulas = fitted_products(learner.ground, t)
+        for _, f in t.formulas:  # the product of two laws may be what splines are not, as a curve's formula
+            left[t.candidate.name] = min(left[t.candidate.name], learner._left(nothing, f, good))
+    least = min(left.values())
+    near = [t for t in good if left[t.candidate.name] < least + RIVAL]
+    best = min(near, key=lambda t: (*plain(t.candidate), left[t.candidate.name]))
+    why = learner._harmful(last or nothing, best)
+    if why and not any(_does_as_well(learner, last or nothing, best, f) for _, f in best.formulas or ()):
+        out.notes.append(f"{best.candidate.name} fits, but is not learned: {why}")
+        return
+    out.tried = [replace(best, rivals=[t.candidate.name for t in near if t is not best])]
+
+
+def _does_as_well(learner: Learner, before: Tried, surface: Tried, formula: Tried) -> bool:
+    """Whether a formula does as well as its surface where that has been learned, and harms no log that goes further."""
+    near = learner._score(formula, [formula, surface]) < learner._score(surface, [formula, surface]) + RIVAL
+    return near and not learner._harmful(before, formula)
+
+
+def _candidates(learner: Learner) -> list[SurfaceCandidate]:
+    """The surfaces at every place of pairs of quantities: those that the best curves are of first, and the place's own.
+    What acts by another may be nothing by itself, so that others follow.
+    """
+    known = [c for c in learner.candidates if may_be_of(c.quantity)]
+    ranked = [t.candidate for column in zip_longest(*learner.ranked) for t in column if t is not None]
+    first = [c.quantity.name for c in ranked if may_be_of(c.quantity)]
+    names = list(dict.fromkeys([*first, *(c.quantity.name for c in known)]))[:QUANTITIES]
+    places = list(dict.fromkeys((c.how, c.at) for c in (*ranked, *known)))
+    both = []
+    for k, place in enumerate(places):
+        here = [c for c in known if (c.how, c.at) == place and (c.quantity.name in names or strange(c) == 0)]
+        order = {c.quantity.name: names.index(c.quantity.name) if c.quantity.name in names else 0 for c in here}
+        both += [(k + order[a.quantity.name] + order[b.quantity.name], a, b) for a, b in combinations(here, 2)]
+    both.sort(key=lambda pair: pair[0])
+    return [s for _, one, two in both[:TRIED] if (s := surface_of(one, two)) is not None]
+
+
+def _finished(learner: Learner, nothing: Tried) -> list[Tried]:
+    """The surfaces that promise most, fitted to the end in place of all curves; best first."""
+    one_step = lambda c: learner._fitted(nothing, c, SCREENED, _begin(learner, nothing, c), 1, True)  # noqa: E731
+    begun = list(learner.each(one_step, _candidates(learner)))
+    begun.sort(key=lambda t: float(t.fit.cost.sum()))
+    few = lambda t: learner._fitted(nothing, t.candidate, SCREENED, t.fit, 5, True)  # noqa: E731
+    quick = list(learner.each(few, begun[:QUICK]))
+    quick.sort(key=lambda t: score(t.judge, t.fit))
+    to_the_end = lambda t: smoothed(learner, nothing, t.candidate, t.fit, WIGGLES)  # noqa: E731
+    done = learner._ordered(list(learner.each(to_the_end, quick[:FINISHED])))
+    if done and learner.fails(done[0]):
+        close = [t for t in done if learner._score(t, done) < learner._score(done[0], done) + NEAR]
+        done = learner._ordered(
+            [*done, *(f for f in learner.each(lambda t: _finer(learner, nothing, t), close) if f is not None)]
+        )
+    first_of = {t.candidate.name: t for t in reversed(done)}
+    return [t for t in done if first_of[t.candidate.name] is t]
+
+
+def _begin(learner: Learner, nothing: Tried, c: SurfaceCandidate) -> Array:
+    """Parameters to begin from: the best curve of either quantity at the same place, where one was fitted alone. A step
+    from no law at all goes astray where a state that runs away is one of the quantities.
+    """
+    out = np.zeros(len(nothing.fit.theta) + len(c.pairs))
+    out[: len(nothing.fit.theta)] = nothing.fit.theta
+    names = [q.name for q, _ in c.axes]
+    for t in learner.ranked[0]:
+        one = t.candidate
+        if (one.how, one.at) == (c.how, c.at) and one.quantity.name in names:
+            axis = names.index(one.quantity.name)
+            basis = c.axes[axis][1]
+            table, amplitudes = t.table()
+            across = np.linalg.lstsq(basis.design(one.grid) @ basis.turn, table(amplitudes), rcond=None)[0]
+            out[: len(nothing.fit.theta)] = t.fit.theta[: len(nothing.fit.theta)]
+            for k, ij in enumerate(c.pairs):
+                if ij[1 - axis] == 0:
+                    out[len(nothing.fit.theta) + k] = across[ij[axis]]
+            break
+    return out
+
+
+def _finer(learner: Learner, nothing: Tried, coarse: Tried) -> Tried | None:
+    """The same surface with `FINE` splines of each quantity."""
+    c = coarse.candidate
+    assert isinstance(c, SurfaceCandidate)
+    fine = surface_of(c, replace(c, quantity=c.other), FINE)
+    if fine is None:
+        return None
+    table, amplitudes = coarse.table()
+    (one, other), n = fine.grids, len(coarse.fit.theta) - len(amplitudes)
+    design = np.kron(fine.basis.design(one), fine.across.design(other)) @ fine.turn
+    theta = np.concatenate([coarse.fit.theta[:n], np.linalg.lstsq(design, table(amplitudes).ravel(), rcond=None)[0]])
+    return smoothed(learner, nothing, fine, theta, WIGGLES, coarse.wiggle)
+
+
+def _sum(learner: Learner, nothing: Tried, whole: Tried) -> Tried:
+    """The sum of a curve of each of a surface's quantities, at its place."""
+    c = whole.candidate
+    assert isinstance(c, SurfaceCandidate)
+    of = dict(zip(c.pairs, whole.fit.theta[len(nothing.fit.theta) :], strict=True))
+    apart = replace(c, additive=True)
+    theta = np.concatenate([whole.fit.theta[: len(nothing.fit.theta)], [of[ij] for ij in apart.pairs]])
+    return learner._fitted(nothing, apart, whole.wiggle, theta, 12)

@@ -1,0 +1,214 @@
+"""Where laws may act on a system, and how large the data are there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from vaneloop.identification.candidates.library import LAWS, SIGNAL_LAWS, STATE_LAWS, Law, Size
+from vaneloop.identification.subsystem import Array, Effect, size_of
+from vaneloop.identification.user_models.codegen import Dispatch, try_law
+from vaneloop.identification.user_models.data import Data
+from vaneloop.identification.user_models.motion import smoothed
+from vaneloop.identification.user_models.simulation import Placed, Runner
+from vaneloop.identification.user_models.system import Record
+
+__all__ = ["Course", "nominal_course", "places"]
+
+SENSOR_OF_FORCE = ("gain", "saturation", "lag", "second_order_lag", "dead_time")  # what follows a sum of forces
+RUN_AWAY = 1e50  # beyond it a simulated value is no size of anything; the numbers of laws made from it stay finite
+
+
+def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed], list[Effect]]:
+    """Every law at every place where it may act, in the same order: what runs, and what the search is told of it."""
+    s = data.system
+    states, commands = (
+        [[np.clip(v, -RUN_AWAY, RUN_AWAY) for v in logs] for logs in of] for of in (course.states, course.commands)
+    )
+    out: list[Placed] = []
+    effects: list[Effect] = []
+
+    def put(name: str, law: Law, place: str, at: int, size: Size, constant: float) -> None:
+        ps, starts = law.make(size)
+        holds: tuple[tuple[str, tuple[float | None, ...]], ...] = ()
+        if law.holds is not None:
+            other, pattern = law.holds
+            holds = ((f"{name.rpartition('.')[0]}.{other}", pattern),)
+        effects.append(Effect(name, tuple(ps), starts, law.looks, holds, law.onward))
+        out.append(Placed(name, law, place, at, constant, neutral=np.array([q.value for q in ps])))
+
+    def add(prefix: str, place: str, name: str, at: int, family: str, size: Size, leave: tuple[str, ...] = ()) -> None:
+        for law in LAWS[family].values():
+            if law.name not in leave:
+                put(f"{prefix}.{law.name}", law, place, at, size, law.constant(size) if law.constant else 0.0)
+        for own in s.laws:
+            if own.on == family and own.allowed(place, name, by_default="bias" not in leave):
+                try_law(own, prefix, size)
+                put(f"{prefix}.{own.name}", dispatch.own[family][own.name], place, at, size, 0.0)
+
+    outputs = list(s.outputs)
+    if s.kind == "force" and s.allows("force", "force"):
+        v = np.concatenate([u[1] for u in data.u])
+        x = np.concatenate([u[0] for u in data.u])
+        force = size_of(np.sqrt(np.nanmean(data.measured[0] ** 2)))
+        unit = s.units.get("position", "m")
+        size = _size(
+            data.records, [u[0] for u in data.u], unit, force=force, force_unit=next(iter(s.outputs.values())),
+            speed=size_of(np.sqrt(np.mean(v**2))), speed_unit=f"{unit}/s",
+            travel=size_of(np.ptp(x) / 2, np.max(np.abs(x))), travel_unit=unit,
+        )  # fmt: skip
+        add("force", "force", "force", 0, "force", size)
+    if s.kind in ("simulate", "closed_loop"):
+        for i, (name, unit) in enumerate(s.states.items()):
+            if not (s.allows("state", name) or (name in s.rates and s.allows("force", name))):
+                continue
+            if name in s.rates.values() and name not in s.rates:
+                continue  # a displacement is the integral of its velocity, whatever else is missing
+            values = states[i]
+            rates = np.concatenate([np.gradient(w, r.t) for w, r in zip(values, data.records, strict=True)])
+            if name in s.rates:
+                j = list(s.states).index(s.rates[name])
+                z = states[j]
+                m = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
+                force_unit = s.force_unit if name in s.masses else f"({unit})/s"
+                size = _size(
+                    data.records, values, unit, force=size_of(np.sqrt(np.nanmean(rates**2)) * m),
+                    force_unit=force_unit,
+                    speed=size_of(np.sqrt(np.nanmean(np.concatenate(values) ** 2))), speed_unit=unit,
+                    travel=size_of(np.ptp(np.concatenate(z)) / 2), travel_unit=s.states[s.rates[name]],
+                )  # fmt: skip
+                add(name, "force", name, i, "force", size)
+            else:
+                size = _size(data.records, values, unit)
+                add(name, "state", name, i, "state", size, ("overflow",))
+                for j, (other, other_unit) in enumerate(s.states.items()):  # into any other of the same kind
+                    if j != i and other_unit == unit and other not in s.rates.values():
+                        put(f"{name}.overflow_to_{other}", STATE_LAWS["overflow"], "state", i, size, float(j))
+    signals = s.commands if s.kind == "closed_loop" else s.inputs
+    for i, (name, unit) in enumerate(signals.items()):
+        if s.allows("input", name):
+            rows = commands[i] if s.kind == "closed_loop" else [u[i + (3 if s.kind == "force" else 0)] for u in data.u]
+            first = 3 if s.kind == "force" else 0
+            add(name, "input", name, i + first, "signal", _size(data.records, rows, unit))
+    for i, name in enumerate(outputs):
+        if name in s.commands or not s.allows("output", name):
+            continue
+        rows = [y[i] for y in data.y]
+        if not np.isfinite(np.concatenate(rows)).any():
+            rows = [np.zeros(len(y[i])) for y in data.y]
+        # a constant force and a constant in the sensor of a force are the same; so are gains
+        named = any(p in (s.places or ()) for p in ("output", name))
+        leave = tuple(x for x in SIGNAL_LAWS if x not in SENSOR_OF_FORCE) if s.kind == "force" and not named else ()
+        prefix = s.reading_of(name)
+        add(prefix, "output", name, i, "signal", _size(data.records, rows, s.outputs[name]), leave)
+    return out, effects
+
+
+def _size(records: Sequence[Record], rows: list[Array], unit: str, **more: Any) -> Size:
+    """How large the data of a place are, given log by log."""
+    good = np.concatenate([v[np.isfinite(v)] for v in rows])
+    if not len(good):
+        good = np.zeros(2)
+    low, high = np.quantile(good, [0.001, 0.999])
+    if not high > low:
+        low, high = float(good.min()), float(good.max())
+    if not high > low:
+        low, high = low - 0.5 * max(abs(low), 1.0), high + 0.5 * max(abs(high), 1.0)
+    rates = np.concatenate([np.gradient(v, r.t)[np.isfinite(v)] for v, r in zip(rows, records, strict=True)])
+    rates = rates[np.isfinite(rates)] if len(rates) else np.zeros(1)
+    rms = float(np.sqrt(np.mean(rates**2))) if len(rates) else 0.0
+    span = max(float(r.t[-1]) for r in records)
+    fastest = float(np.quantile(np.abs(rates), 0.999)) if len(rates) else 0.0
+    least = (high - low) / span
+    step = float(np.median(np.diff(records[0].t)))
+    changes = [np.diff(r.t[1:][np.diff(v) != 0.0]) for v, r in zip(rows, records, strict=True)]
+    held = float(np.median(np.concatenate(changes))) if any(map(len, changes)) else 0.0
+    rate, top = max(rms, least), max(fastest, least)
+    return Size(float(low), float(high), rate, top, step, span, unit=unit, held=held, **more)
+
+
+# ---- States and commands of the nominal model, measured where they are: they give laws inside the model their sizes
+
+
+@dataclass(eq=False)
+class Course:
+    """How the nominal model goes.
+
+    states, commands  of each, log by log
+    smalls            state by state, speed within which friction is regularised; 0 where the state is no velocity
+    """
+
+    states: list[list[Array]] = field(default_factory=list)
+    commands: list[list[Array]] = field(default_factory=list)
+    smalls: Array = field(default_factory=lambda: np.zeros(0))
+
+
+def nominal_course(runner: Runner, values: Array) -> Course:
+    """Course of the nominal model with these values of its parameters."""
+    s, data = runner.system, runner.data
+    names = list(s.states)
+    course = Course([[] for _ in names], [[] for _ in s.commands], np.zeros(len(names)))
+    y = runner.run(values[None])[0]
+    for log, (r, at) in enumerate(zip(data.records, data.logs.values(), strict=True)):
+        hidden = None
+        for i, name in enumerate(names):
+            if name in r.columns:
+                v = np.where(
+                    np.isfinite(r.columns[name]),
+                    r.columns[name],
+                    y[list(s.outputs).index(name), at] if name in s.outputs else 0.0,
+                )
+            elif name in s.rates and s.rates[name] in r.columns:
+                v = np.gradient(smoothed(r.t, r.columns[s.rates[name]]), r.t)
+            else:
+                hidden = _hidden(runner, values, log) if hidden is None else hidden
+                v = hidden[i]
+            course.states[i].append(v)
+        for i, name in enumerate(s.commands):
+            if name in r.columns:
+                course.commands[i].append(r.columns[name])
+            elif name in s.outputs:
+                course.commands[i].append(y[list(s.outputs).index(name), at])
+            else:
+                course.commands[i].append(np.linspace(-1.0, 1.0, len(r.t)))
+    for i, name in enumerate(names):
+        if name in s.rates:
+            course.smalls[i] = 1e-3 * float(np.sqrt(np.mean(np.concatenate(course.states[i]) ** 2)))
+    return course
+
+
+def _hidden(runner: Runner, values: Array, log: int) -> Array:
+    """Courses of all states as if none were measured, float64[states, samples], from the nominal model in open loop
+    with measured inputs.
+    """
+    s, data, code = runner.system, runner.data, runner.code
+    if s.kind == "closed_loop":
+        return np.tile(np.linspace(-1.0, 1.0, len(data.records[log].t)), (len(s.states), 1))
+    p = code.P(*values[: len(s.parameters)]) if s.parameters else code.P(0.0)
+    t, u = data.records[log].t, data.u[log]
+    x = np.array([data.first_state(log, m, 0.0) for m in s.states])
+    for k, (which, m) in enumerate(runner.free_starts):
+        if which == log:
+            x[m] = values[len(s.parameters) + k]
+    out = np.empty((len(s.states), len(t)))
+    restart, at_restart = data.restarts(log, len(t))
+    stride = max(1, len(t) // 4000)
+    last = 0
+    for k in range(0, len(t), stride):
+        if restart.any() and restart[last + 1 : k + 1].any():
+            x = at_restart[:, k].copy()
+        dt = (t[k] - t[last]) / 4
+        for _ in range(4 if k else 0):
+            f = s.model
+            ui = code.U(*u[:, last]) if len(u) else code.U(0.0)
+            a = np.atleast_1d(np.asarray(f(code.X(*x), ui, p), dtype=float))
+            b = np.atleast_1d(np.asarray(f(code.X(*(x + 0.5 * dt * a)), ui, p), dtype=float))
+            x = x + dt * b
+        out[:, k : k + stride] = x[:, None]
+        last = k
+    bad = ~np.isfinite(out)
+    out[bad] = 0.0
+    return out

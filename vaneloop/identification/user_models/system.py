@@ -1,0 +1,246 @@
+"""A user's own model: which channels it explains, how, and where laws may act. `Bound` turns it, with logs, into a
+`Stage`.
+
+kind         the model is                                  scored
+-----------  --------------------------------------------  -------------------------------------------------------
+static       y = model(u, p)                               at every sample
+force        force = model(u, p) from measured motion      at every sample (inverse dynamics); u has position,
+                                                           velocity, acceleration
+simulate     dx/dt = model(x, u, p)                        free run from the start, or in windows restarted from
+                                                           measured states
+closed_loop  dx/dt = model(x, u, p), u = control(r, y, p)  free run with the loop closed
+
+docs/your_own_model.md says which to choose when.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vaneloop.identification.subsystem import Array, Parameter, StageError
+from vaneloop.identification.user_models.user_laws import Law, check_parameters, is_name
+
+if TYPE_CHECKING:
+    from plant.model import Learned
+    from vaneloop.identification.user_models.bound_system import Bound
+
+__all__ = ["Record", "System", "unknown"]
+
+KINDS = ("static", "force", "simulate", "closed_loop")
+BETWEEN = ("hold", "line", "smooth")
+
+
+def unknown(name: str, value: float, unit: str, low: float = -np.inf, high: float = np.inf) -> Parameter:
+    """A parameter that the logs must tell: fitted from ``value``, which need be right within a factor of ten or so,
+    within its bounds.
+    """
+    return Parameter(name, value, unit, low, high, np.inf)
+
+
+@dataclass(eq=False)
+class Record:
+    """One log: times (s) and channels on them, float64[samples]; NaN where nothing was measured.
+
+    begin  s: where it begins in the log that it was cut out of
+    """
+
+    name: str
+    t: Array
+    columns: dict[str, Array]
+    begin: float = 0.0
+
+
+@dataclass
+class System:
+    """A model and what is needed to hold it against logs.
+
+    kind        static, force, simulate or closed_loop
+    model       see above; gets named tuples: u.pump, x.level, p.area. Plain Python on numbers (simulate, closed_loop:
+                compiled with numba where it can be) or on whole arrays (static, force)
+    outputs     measured channels that it explains, name -> unit, in the order in which the model (or ``output``)
+                returns them
+    inputs      measured channels that drive it, name -> unit
+    parameters  `Parameter` (known: exactly, or within a tolerance that is refitted) or `unknown`
+    position, velocity   force: the channel of the displacement, of its rate, or of both: what is missing is
+                         differentiated, or integrated from a start that is fitted to each log (``start_position``)
+    cutoff      force: frequency in Hz up to which forces are compared, and three times which motion is differentiated
+                where its noise allows; default: from the measured force
+    start_force force: hysteretic elements start a log "unloaded", in the middle of their gap, or with the force
+                "measured" there
+    states      simulate: name -> unit, in the order in which the model returns their derivatives
+    rates       simulate: velocity -> displacement, for states that are these; laws of friction then act on the velocity
+    masses      simulate: velocity -> name of the parameter that divides forces there, so that laws there are in units
+                of force
+    force_unit  unit of forces on states with a mass
+    output      simulate: function output(x, u, p); default: the states that are named like the outputs
+    start       state -> value at the start of a log, or "fitted"; others start at their measured value, velocities of
+                rates at rest, and what is not measured is fitted
+    window      s: start anew from the measured states after each window of this length (for what integrates)
+    between     simulate: what an input does between two samples: "hold", "line", or "smooth", a curve (a cubic spline)
+    control, commands   closed_loop: u = control(r, y, p), and the names and units of u; r has the inputs, y the outputs
+                        after the sensors' laws
+    places      where laws may act, of "input", "force", "state", "output", or channels and states by name; default:
+                everywhere
+    read        function path -> {"t": ..., channel: ...} for files that `vaneloop` cannot read
+    units       of the position of kind force, {"position": "mm"}
+    laws        laws of your own beside the library's, `Law`
+    without     laws (``place.law``) that are not looked for
+    """
+
+    name: str
+    kind: str
+    model: Callable[..., Any]
+    outputs: dict[str, str]
+    inputs: dict[str, str] = field(default_factory=dict)
+    parameters: Sequence[Parameter] = ()
+    position: str | None = None
+    velocity: str | None = None
+    cutoff: float | None = None
+    start_force: str = "unloaded"
+    states: dict[str, str] = field(default_factory=dict)
+    rates: dict[str, str] = field(default_factory=dict)
+    masses: dict[str, str] = field(default_factory=dict)
+    force_unit: str = "N"
+    output: Callable[..., Any] | None = None
+    start: dict[str, float | str] = field(default_factory=dict)
+    window: float | None = None
+    between: str = "hold"
+    control: Callable[..., Any] | None = None
+    commands: dict[str, str] = field(default_factory=dict)
+    places: Sequence[str] | None = None
+    read: Callable[[str], Mapping[str, Any]] | None = None
+    units: dict[str, str] = field(default_factory=dict)
+    laws: Sequence[Law] = ()
+    without: Sequence[str] = ()
+
+    @property
+    def holds(self) -> bool:
+        """Whether an input keeps its value until the next one comes."""
+        return self.kind in ("simulate", "closed_loop") and self.between == "hold"
+
+    def __post_init__(self) -> None:
+        """Check what the user wrote; one line says what is wrong and what is allowed."""
+        self._check()
+
+    def _check(self) -> None:
+        def wrong(text: str) -> StageError:
+            return StageError(f"system {self.name!r}: {text}")
+
+        if self.kind not in KINDS:
+            raise wrong(f"kind (={self.kind!r}) must be one of {', '.join(KINDS)}")
+        if not callable(self.model):
+            raise wrong(f"model (={self.model!r}) must be a function")
+        if not self.outputs:
+            raise wrong("outputs is empty; at least one measured channel must be explained")
+        for what, given in (
+            ("inputs", self.inputs),
+            ("outputs", self.outputs),
+            ("states", self.states),
+            ("commands", self.commands),
+        ):
+            if not isinstance(given, dict):
+                raise wrong(f"{what} (={given!r}) must be a dict of name -> unit")
+            for n in given:
+                if not is_name(n):
+                    raise wrong(
+                        f"{what}: {n!r} must be a Python name (letters, digits, _); --map renames a log's channel"
+                    )
+        check_parameters(self.parameters, wrong)
+        names = [p.name for p in self.parameters]
+        moves = self.kind in ("simulate", "closed_loop")
+        if self.kind == "force" and not (self.position or self.velocity):
+            raise wrong("kind 'force' needs position=, the channel of the displacement, or velocity=, that of its rate")
+        if moves and not self.states:
+            raise wrong(f"kind {self.kind!r} needs states=, name -> unit")
+        if self.kind == "closed_loop" and not (self.control and self.commands):
+            raise wrong(
+                "kind 'closed_loop' needs control=, a function (r, y, p), and commands=, name -> unit of what it "
+                "returns"
+            )
+        for v, x in self.rates.items():
+            for n in (v, x):
+                if n not in self.states:
+                    raise wrong(f"rates: {n!r} is not a state; states are {', '.join(self.states)}")
+        for v, m in self.masses.items():
+            if v not in self.rates:
+                raise wrong(f"masses: {v!r} is not a velocity of rates")
+            if m not in names:
+                raise wrong(f"masses: {m!r} is not a parameter; parameters are {', '.join(names)}")
+        for s, begin in self.start.items():
+            if s not in self.states:
+                raise wrong(f"start: {s!r} is not a state; states are {', '.join(self.states)}")
+            if begin == "fitted" and self.window:
+                raise wrong(f"start: {s!r} 'fitted' does not go with window=, which starts from measured states")
+            number = isinstance(begin, int | float | np.floating | np.integer) and not isinstance(begin, bool)
+            if begin != "fitted" and not (number and np.isfinite(float(begin))):
+                raise wrong(f"start: {s!r} (={begin!r}) must be a number or 'fitted'")
+        if moves and self.output is None:
+            for o in self.outputs:
+                if o not in self.states and o not in self.commands:
+                    raise wrong(
+                        f"output {o!r} is not a state; name it like one of {', '.join(self.states)}, or give output=, "
+                        f"a function (x, u, p)"
+                    )
+        if self.between not in BETWEEN:
+            raise wrong(f"between (={self.between!r}) must be one of {', '.join(BETWEEN)}")
+        if self.start_force not in ("unloaded", "measured"):
+            raise wrong(f"start_force (={self.start_force!r}) must be 'unloaded' or 'measured'")
+        for what, size in (("window", self.window), ("cutoff", self.cutoff)):
+            if size is not None and not (np.isfinite(size) and size > 0):
+                raise wrong(f"{what} (={size!r}) must be above 0")
+        known = {"input", "force", "state", "output", *self.inputs, *self.outputs, *self.states, *self.commands}
+        for place in self.places or ():
+            if place not in known:
+                raise wrong(f"places: {place!r} is not known; allowed: {', '.join(sorted(known))}")
+        if not isinstance(self.laws, list | tuple):
+            raise wrong(f"laws (={self.laws!r}) must be a list of Law(...)")
+        for law in self.laws:
+            if not isinstance(law, Law):
+                raise wrong(f"laws: {law!r} is not a Law; write Law(name, on, function, parameters, starts)")
+            if [other.name for other in self.laws].count(law.name) > 1:
+                raise wrong(f"laws: two are named {law.name!r}")
+            for place in law.places or ():
+                if place not in known:
+                    allowed = ", ".join(sorted(known))
+                    raise wrong(f"law {law.name!r}: places: {place!r} is not known; allowed: {allowed}")
+
+    def channels(self) -> tuple[str, ...]:
+        """Names that a log must have."""
+        motion = [c for c in (self.position, self.velocity) if c]
+        return tuple(dict.fromkeys([*self.inputs, *motion, *(o for o in self.outputs)]))
+
+    def optional(self) -> set[str]:
+        """Outputs that need not be logged: those that only the loop uses."""
+        return set(self.outputs) if self.kind == "closed_loop" else set()
+
+    def allows(self, place: str, name: str) -> bool:
+        """Whether laws may act at ``name`` (a channel or state) or at all places of its kind."""
+        return self.places is None or place in self.places or name in self.places
+
+    def reading_of(self, output: str) -> str:
+        """What an output is called as a place of laws: its sensor, where an input or a state has the same name."""
+        return f"{output}_sensor" if output in self.inputs or output in self.states else output
+
+    def bind(
+        self,
+        records: Sequence[Record],
+        like: Bound | None = None,
+        values: Mapping[str, float] | None = None,
+        present: Mapping[str, Mapping[str, float]] | None = None,
+        curves: Mapping[str, Learned] | None = None,
+    ) -> Bound:
+        """Put logs into this system: its stage for the search, its parameters' starts. Raises StageError for a log that
+        cannot be.
+
+        like     a bound whose noise and scales to use: that of the fitted logs, for test logs
+        values   values of the system's parameters from a model file
+        present  laws that the model has by now, effect name -> parameters; they are part of it and not looked for again
+        curves   laws that were learned, by name: they may be present, or asked for
+        """
+        from vaneloop.identification.user_models.bound_system import Bound
+
+        return Bound(self, records, like, values, present, curves)

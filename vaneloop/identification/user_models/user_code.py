@@ -1,0 +1,234 @@
+"""The functions that a user wrote for a system, called with named tuples; what goes wrong in them becomes one line."""
+
+from __future__ import annotations
+
+import traceback
+from collections import Counter, namedtuple
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from numba.core import compiler, ir
+from numba.core.compiler_machinery import FunctionPass, register_pass
+from numba.core.ir_utils import build_definitions, find_callname, guard
+from numba.core.untyped_passes import ReconstructSSA
+
+from vaneloop.identification.subsystem import Array, StageError
+from vaneloop.identification.user_models.system import System
+
+__all__ = ["InATuple", "UserCode", "cannot", "place_of"]
+
+
+class UserCode:
+    """The functions of a system.
+
+    P, U, X, Y, R   types of their arguments: parameters, what drives the model, states, outputs, and what the control
+                    follows
+    single, single_out, single_control   the model, output or control returns a number and no sequence
+    """
+
+    def __init__(self, system: System, in_names: list[str]):
+        self.system, self.in_names = system, in_names
+        self.single = self.single_out = self.single_control = False
+        s = system
+        self.P = _tuple_type("P", [p.name for p in s.parameters])
+        self.U = _tuple_type("U", list(s.commands) if s.kind == "closed_loop" else self.in_names)
+        self.X = _tuple_type("X", list(s.states))
+        self.Y = _tuple_type("Y", list(s.outputs))
+        self.R = _tuple_type("R", self.in_names)
+
+    def call(self, what: str, f: Callable[..., Any], *args: Any) -> Any:
+        """Call a function of the user; its exception becomes one line."""
+        try:
+            return f(*args)
+        except StageError:
+            raise
+        except Exception as e:
+            fields = getattr(getattr(e, "obj", None), "_fields", None)
+            why = (
+                f"no {e.name!r} among {', '.join(fields)}"
+                if isinstance(e, AttributeError) and fields
+                else f"{type(e).__name__}: {e}"
+            )
+            raise StageError(f"system {self.system.name!r}: {what} failed{place_of(e)}: {why}") from None
+
+    def flat(self, what: str, value: Any, n: int, of: str) -> list[float]:
+        """What a function returned, as ``n`` numbers; else one line says what it should be."""
+        values = list(value) if isinstance(value, tuple | list | np.ndarray) and np.ndim(value) else [value]
+        if len(values) != n:
+            raise StageError(
+                f"system {self.system.name!r}: {what} returned {len(values)} values; {n} are needed ({of})"
+            )
+        for name, v in zip(of.split(", "), values, strict=True):
+            if np.ndim(v) != 0:
+                raise StageError(
+                    f"system {self.system.name!r}: {what} returned an array of shape {np.shape(v)} for {name}; a "
+                    f"number is needed"
+                )
+            if isinstance(v, str | complex | np.complexfloating) or v is None:
+                raise StageError(
+                    f"system {self.system.name!r}: {what} returned {v!r} for {name} at the first sample; a number is "
+                    f"needed"
+                )
+            if not np.isfinite(v):
+                raise StageError(
+                    f"system {self.system.name!r}: {what} returned {v} for {name} at the first sample; it must be "
+                    f"finite"
+                )
+        return [float(v) for v in values]
+
+    def try_once(self, states: Sequence[float], drives: Array, measured: Array) -> None:
+        """Call each function of a simulation at the first sample and see what it returns."""
+        s = self.system
+        p = self.P(*[q.value for q in s.parameters]) if s.parameters else self.P(0.0)
+        x = self.X(*states)
+        r = self.R(*drives) if self.in_names else self.R(0.0)
+        control = s.control
+        if s.kind == "closed_loop":
+            assert control is not None
+            y = self.Y(*[float(v) if np.isfinite(v) else 0.0 for v in measured])
+            got = self.call("control", control, r, y, p)
+            u = self.U(*self.flat("control", got, len(s.commands), ", ".join(s.commands)))
+            self.single_control = np.ndim(got) == 0
+        else:
+            u, self.single_control = r, False
+        d = self.call("model", s.model, x, u, p)
+        self.flat("model", d, len(s.states), ", ".join(s.states))
+        self.single = np.ndim(d) == 0
+        self.single_out = False
+        if s.output is not None:
+            o = self.call("output", s.output, x, u, p)
+            self.flat("output", o, len(s.outputs), ", ".join(s.outputs))
+            self.single_out = np.ndim(o) == 0
+
+    def static(self, p: Array, u: Array, t: Array, check: bool = False) -> Array:
+        """Outputs float64[outputs, samples] of a model of kind static or force, driven by ``u`` at times ``t``."""
+        s = self.system
+        n = u.shape[1] if u.size else len(t)
+        args = self.R(*u) if len(u) else self.R(np.zeros(n))
+        values = self.call("model", s.model, args, self.P(*p) if len(p) else self.P(0.0))
+        rows = list(values) if isinstance(values, tuple | list) else [values]
+        if len(rows) != len(s.outputs) and np.ndim(values) == 2:
+            rows = list(np.asarray(values))
+        if len(rows) != len(s.outputs):
+            raise StageError(
+                f"system {s.name!r}: model returned {len(rows)} values; {len(s.outputs)} are needed "
+                f"({', '.join(s.outputs)})"
+            )
+        out = np.empty((len(rows), n))
+        for i, (name, row) in enumerate(zip(s.outputs, rows, strict=True)):
+            row = np.asarray(row, dtype=float)
+            if row.shape not in ((), (n,)):
+                raise StageError(
+                    f"system {s.name!r}: model returned shape {row.shape} for {name}; ({n},) is needed, one value a "
+                    f"sample"
+                )
+            if check and not np.all(np.isfinite(row)):
+                k = int(np.flatnonzero(~np.isfinite(np.broadcast_to(row, (n,))))[0])
+                raise StageError(
+                    f"system {s.name!r}: model returned {np.broadcast_to(row, (n,))[k]} for {name} "
+                    f"at t = {t[k]:g} s; it must be finite"
+                )
+            out[i] = row
+        return out
+
+
+def _tuple_type(name: str, fields: Sequence[str]) -> Any:
+    return namedtuple(name, list(fields) or ["nothing"])
+
+
+def place_of(e: BaseException) -> str:
+    """Where in the user's file an exception came from."""
+    ours = str(Path(__file__).parents[1]), str(Path(numba.__file__).parent), "<frozen"
+    frames = [f for f in traceback.extract_tb(e.__traceback__) if not f.filename.startswith(ours)]
+    return f" at line {frames[-1].lineno} of {Path(frames[-1].filename).name}" if frames else ""
+
+
+def cannot(e: BaseException) -> str:
+    """Why numba cannot compile a function of the user, in some words."""
+    if "IMPORT_NAME" in str(e):
+        return "an import inside a function; it belongs at the top of the file"
+    said = [line.strip() for line in str(e).splitlines() if line.strip() and "nopython" not in line]
+    return (said[0] if said else type(e).__name__)[:100]
+
+
+# ---- How a user's function is compiled that returns a list
+
+# what has no types
+_register: Any = register_pass
+_Expr: Any = ir.Expr
+_definitions: Any = build_definitions
+_guard: Any = guard
+_usual: Any = compiler.DefaultPassBuilder.define_nopython_pipeline
+ARRAYS = {("array", "numpy"), ("asarray", "numpy")}  # what makes an array of a list
+
+
+@_register(mutates_CFG=False, analysis_only=False)
+class _ReturnTuples(FunctionPass):
+    """``return [a, b]`` and ``return np.array([a, b])`` return ``(a, b)``."""
+
+    _name = "vaneloop_return_tuples"
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+
+    def run_pass(self, state: Any) -> bool:
+        """Where each return gives a tuple, or a list of the same length that nothing else uses."""
+        ends = _ends(state.func_ir)
+        for made, unpacked in ends or ():
+            made.value = _Expr.build_tuple(items=made.value.items, loc=made.value.loc)
+            if unpacked is not None:
+                unpacked.value = made.target
+        if ends:
+            state.func_ir._definitions = _definitions(state.func_ir.blocks)
+        return bool(ends)
+
+
+class InATuple(compiler.CompilerBase):
+    """numba's compiler with that pass."""
+
+    def define_pipelines(self) -> list[Any]:
+        """The usual ones."""
+        passes = _usual(self.state)
+        passes.add_pass_after(_ReturnTuples, ReconstructSSA)
+        passes.finalize()
+        return [passes]
+
+
+def _ends(func_ir: Any) -> list[tuple[Any, Any]]:
+    """Of each return of a list: the statement that makes the list, and the one that makes an array of it or None."""
+    statements = [s for block in func_ir.blocks.values() for s in block.body if not isinstance(s, ir.Del)]
+    sets = {s.target.name: s for s in statements if isinstance(s, ir.Assign)}
+    defined = Counter(s.target.name for s in statements if isinstance(s, ir.Assign))
+    used = Counter(v.name for s in statements for v in s.list_vars())  # its definition, and each use
+    ends, lengths = [], set()
+    for end in (s for s in statements if isinstance(s, ir.Return)):
+        name, array = end.value.name, None
+        while True:
+            s = sets.get(name)
+            if s is None or defined[name] != 1 or used[name] != 2:
+                return []
+            value = s.value
+            if isinstance(value, ir.Var):
+                name = value.name
+            elif not isinstance(value, ir.Expr):
+                return []
+            elif value.op == "cast":
+                name = value.value.name
+            elif value.op == "call" and array is None and _makes_array(func_ir, value):
+                name, array = value.args[0].name, s
+            elif value.op == "build_list" and value.items:
+                ends.append((s, array))
+                break
+            elif value.op == "build_tuple" and array is None:
+                break
+            else:
+                return []
+        lengths.add(len(value.items))
+    return ends if len(lengths) == 1 else []
+
+
+def _makes_array(func_ir: Any, call: Any) -> bool:
+    return _guard(find_callname, func_ir, call) in ARRAYS and len(call.args) == 1 and not call.kws and not call.vararg

@@ -1,0 +1,3 @@
+"""The vane chain as subsystems, one module each, and what they share."""
+
+__all__: list[str] = []

@@ -1,0 +1,101 @@
+"""Stage `actuator`: stroke from the servo valve's current, in windows with the stroke free."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from plant import chain, places
+from plant.effects import oil_compressibility, piston_stiction
+from plant.parameters import derive
+from plant.stages import actuator_run, step_currents
+from vaneloop.identification.subsystem import Array, Named, Stage, without_jumps
+from vaneloop.identification.vane_chain.parameters import declared, lanes, like_time
+from vaneloop.identification.vane_chain.resample import RASTER, SUBSTEPS, WINDOW, lately, rms
+from vaneloop.identification.vane_chain.subsystem_data import Driven, Made, excerpts
+
+__all__ = ["actuator_stage"]
+
+NEAR_STOP = 0.3  # mm, where a piston rests on its stop
+# mm: what a valve and piston without mass and oil spring leave of one that has them, and one inertia of motor, screw
+# and rod of two masses on a spring that rub as bristles do; logs of the rig without noise leave 0.0004, and 0.0008 to
+# 0.0015
+SIMPLER = {"hydraulic": 4e-4, "electromechanical": 1.1e-3}
+
+
+def actuator_stage(driven: Driven) -> Stage:
+    """Stroke from the current of every tick, started anew in each window."""
+    t, c, machine, _, outputs, run = driven[:6]
+    parameters, effects, rows, si = declared("actuator", driven)
+    signals = driven.signals()
+    dt = float(t[1] - t[0])
+    # the current of every tick, where it is known: its noise is dither to a valve with hysteresis or overlap
+    substeps = c["ticks"].shape[1] if "ticks" in c else SUBSTEPS if dt < 1.5 * RASTER else int(round(dt / 2e-3))
+    i = np.ascontiguousarray(c.get("ticks", c["i_cmd"]) * 1e-3)
+    others = np.ascontiguousarray(c["other_ticks"] * 1e-3) if "other_ticks" in c else i
+    n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
+    p_s, t_oil = np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"])
+    x = np.ascontiguousarray(c["x_lvdt"] * 1e-3)
+
+    logged = step_currents(i, dt, substeps)
+
+    def simulate(thetas: Array, current: Array = logged, t_oil: Array = t_oil) -> Array:
+        p = lanes(driven, thetas, rows, si)
+        derive(p, dt / current.shape[1], dt)
+        s = np.zeros((chain.N_STATE, len(thetas)))
+        s[places.X] = s[places.X_LVDT] = x[0]
+        out = np.empty((len(thetas), 1, len(t)))
+        known = driven.slipping(signals, p)
+        actuator_run(current, n_r, p_s, t_oil, dt, p, s, out[:, 0].T, x, int(round(WINDOW / dt)), known)
+        out *= 1e3
+        return out
+
+    # a piston that leaned on a stop leaves it only when its chambers have turned their pressures round, which no
+    # valve's curve tells
+    stroke = np.clip(c["x_lvdt"], 0.0, known_stroke := machine.table.actuator.stroke.value)
+    leaning = np.minimum(stroke, known_stroke - stroke) < NEAR_STOP
+    run = run & (leaning | ~lately(leaning, WINDOW, dt))
+    measured = np.where(run, c["x_lvdt"], np.nan)[None]
+    stage = Stage("actuator", outputs, ("mm",), parameters, effects, simulate, t, measured, window=WINDOW)
+    stage.finer = lambda thetas: simulate(thetas, step_currents(i, dt, 4 * substeps))
+    ageing = like_time(t, t_oil)
+    stage.twins = {name: ("time", lambda thetas: simulate(thetas, t_oil=ageing)) for name in ("oil_viscosity",)}
+    stage.alike = {"valve_flow_saturation": _quadratic_drag}
+    window = int(round(WINDOW / dt))
+
+    columns = stage.index()
+
+    def hidden(theta: Array) -> Array:
+        out = simulate(theta[None])[0]
+        between = rms(stage, out - simulate(theta[None], step_currents(others, dt, substeps))[0])
+        if "piston_stiction" not in columns or theta[columns["piston_stiction"].start] == 0.0:
+            return between
+        excess, speed = theta[columns["piston_stiction"]] * (1.0, 1e-3)
+        give = oil_compressibility.NOMINAL
+        if "oil_compressibility" in columns:
+            give += 1e-6 * float(theta[columns["oil_compressibility"].start])  # mm/kN
+        force = piston_stiction.scatter(np.gradient(without_jumps(stage, out[0])) * 1e-3 / dt, excess, speed)
+        return np.hypot(between, 1e3 * give * float(np.sqrt(np.mean(force[np.isfinite(measured[0])] ** 2))))
+
+    stage.raster_error = np.array([SIMPLER[machine.kind]])
+    if others is not i:
+        stage.hidden = hidden
+        if not driven.again:
+            stage.raster_error = np.hypot(stage.raster_error, hidden(stage.neutral()))
+
+    def kept(at: Array) -> Array:
+        keep = run[at]
+        for b in np.flatnonzero(np.diff(at, prepend=at[0] - 2) != 1):  # the spool and the lags come from another time
+            keep[b : b + window] = False
+        return keep
+
+    stage.counted = kept
+    stage.excerpt, stage.made = excerpts(actuator_stage, driven, stage, kept), Made(actuator_stage, driven)
+    return stage
+
+
+def _quadratic_drag(named: Named) -> str:
+    """A drag b v^2 takes b v^2 / A off the pressure drop of the orifices, so v = v0 / sqrt(1 + (v0 / limit)^2): an
+    orifice in series, the round end of the saturation.
+    """
+    round_end = float(named["valve_flow_saturation"]["roundness"]["high"]) >= 1.0 - 1e-6
+    return "a drag that grows with the square of the speed" if round_end else ""

@@ -1,0 +1,291 @@
+"""The vane chain as stages: with the stages in `vane_stages`, all that the search knows of a vane.
+
+| stage    | driven by (logged)      | explains (logged)         | scored                                            |
+|----------|-------------------------|---------------------------|---------------------------------------------------|
+| demand   | n_dem, n_r              | x_dem                     | the firmware's own trend, tables and rate limits  |
+| servo    | x_dem, x_lvdt           | i_cmd                     | windows, integral free                            |
+| engine   | n_dem                   | n_r                       | free run                                          |
+| actuator | i_cmd, n_r, p_s, t_oil  | x_lvdt                    | windows, stroke free                              |
+| linkage  | x_lvdt, n_r, t_oil      | the vanes' angles, jointly | free run, play a state                            |
+
+All stages run on one raster of 10 ms, the ECU frame's period, or the log's own where that is slower. Noise floors are
+measured on the errors of the nominal model, whose motion is mostly gone, and where the raster is slow the error that it
+causes is measured and added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import binary_propagation
+
+from controller import Calibration, load_calibration
+from controller.records import RUN
+from hil.figures import noise_floor, resolution, resolution_before
+from hil.logs import Log, LogError
+from hil.loop.tick import flashed
+from plant import Plant, build_plant
+from plant.curve import QUANTITIES
+from plant.effects import CURVES
+from plant.layout import C_OF, CURVE_ROWS, MOST_CURVES
+from vaneloop.base.signals import UNITS
+from vaneloop.base.vanes import VANES, same_stages
+from vaneloop.identification.subsystem import Array, Stage, noise_of
+from vaneloop.identification.vane_chain.actuator import actuator_stage
+from vaneloop.identification.vane_chain.candidates import OF_STROKE, reversals, room_for
+from vaneloop.identification.vane_chain.current import (
+    DRAWS,
+    SAMPLED,
+    between_rows,
+    other_current,
+    servo_law,
+    without_noise,
+)
+from vaneloop.identification.vane_chain.demand import demand_stage, own_demand_stage
+from vaneloop.identification.vane_chain.engine import engine_stage
+from vaneloop.identification.vane_chain.linkage import linkage_stage
+from vaneloop.identification.vane_chain.resample import (
+    RASTER,
+    SETTLE,
+    Grid,
+    every_other,
+    grid_of,
+    no_gap_in_window,
+    on_raster,
+    regimes_of,
+    rms,
+    since,
+    stretches,
+)
+from vaneloop.identification.vane_chain.servo import servo_stage
+from vaneloop.identification.vane_chain.subsystem_data import Driven
+
+__all__ = ["STAGE_ORDER", "Chain", "build_chain"]
+
+STAGE_ORDER = ("demand", "servo", "engine", "actuator", "linkage")
+MEMORY = 10.0  # s, longer than any stage here remembers
+LEAST_FLOOR = {
+    "demand": 2e-3,
+    "servo": 1e-3,
+    "engine": 1e-4,
+    "actuator": 1e-4,
+    "linkage": 1e-3,
+}  # border units: nobody measures finer
+
+
+@dataclass(eq=False)
+class Chain:
+    """The stages of one log.
+
+    stages        the stages that can be judged
+    not_observed  stage -> what the log lacks
+    columns       channel -> values on the common raster ``t`` (border units), for plots
+    steps         channel -> step (border unit) in which its reading comes, where its converter's low bits are lost
+    test          the stages on a part of the log that nothing is fitted to; None: there is none
+    whole         of a long log, of which these are the stages of an excerpt: all of it; None: it is here whole
+    plant, built, calibration  the machine; its controller's tables, and the same as flashed (`hil.loop.tick.flashed`)
+    """
+
+    t: Array
+    stages: list[Stage]
+    not_observed: dict[str, str]
+    columns: dict[str, Array]
+    plant: Plant
+    built: Calibration
+    calibration: Calibration
+    notes: list[str] = field(default_factory=list)
+    steps: dict[str, float] = field(default_factory=dict)
+    test: Chain | None = None
+    whole: Any = None
+
+    def stage(self, name: str) -> Stage:
+        """Return a stage by name."""
+        return next(s for s in self.stages if s.name == name)
+
+
+def build_chain(
+    log: Log,
+    plant: Plant | None = None,
+    calibration: Calibration | None = None,
+    present: tuple[str, ...] = (),
+    grid: Grid | None = None,
+    pieces: Sequence[tuple[int, int]] = (),
+    draws: int = DRAWS,
+) -> Chain:
+    """Put ``log`` on one raster and make every stage that its channels allow.
+
+    present  effects that the model already has: they are part of ``plant`` and not tried again
+    grid     of the log, where it is known
+    pieces   rows of it, as `on_raster` takes them: the stages of these only
+    draws    of what the log hides from the servo
+    """
+    machine = plant or build_plant()
+    tables = calibration or load_calibration()
+    same_stages(geometry=machine.vanes, vane_angles=tables.vanes)
+    cal = flashed(tables, machine)
+    theirs = tables.program is not None  # a controller of the user's own: its servo's law is not known
+    t, columns, fresh, lacking, notes = on_raster(log, grid or grid_of(log), pieces)
+    if len(t) < 500:
+        raise LogError(
+            f"{log.path}: {len(t)} samples of {t[1] - t[0] if len(t) > 1 else 0:g} s; at least 500 are needed to "
+            f"search for missing physics"
+        )
+    dt = float(t[1] - t[0])
+    # after a gap everything is as at the start of a log: what the stages remember must come from the rows behind it
+    fresh = ~binary_propagation(~fresh, mask=~fresh | lacking)
+    stretch = stretches(fresh)
+    usable = fresh & (since(t, stretch) >= SETTLE) & no_gap_in_window(t, fresh)
+    run = law_holds = machine_rows = currents = usable
+    spell = machine_spell = stretch
+    if "state" in columns:
+        running = np.round(columns["state"]) == RUN
+        run = usable & running
+        spell = stretches(fresh & running)  # nor is it known what a controller in another mode has made of the demand
+        law_holds = run & (since(t, spell) >= SETTLE)  # back in RUN, it first catches up
+        # the machine obeys its physics in any mode; where the controller mostly stood aside, that is all there is
+        share = float(run.sum()) / max(float(usable.sum()), 1.0)
+        machine_rows = run if share >= 0.5 else usable
+        machine_spell = spell if share >= 0.5 else stretch
+        currents = law_holds if share >= 0.5 else usable  # between two rows they follow from the firmware's law
+        if share < 0.5:
+            notes.append(
+                f"state: mode RUN in {share:.0%} of the log; engine, actuator and linkage are judged in all modes"
+            )
+    foreign = [v for v in VANES if v in columns and v not in machine.vanes]
+    notes += [f"{v}: this machine has no such stage (geometry); not judged" for v in foreign]
+    if room_for(machine.p) < MOST_CURVES:
+        logged = {*columns, *machine.usual, "time", *(OF_STROKE if "x_lvdt" in columns else ())}
+        curves = range(CURVES + 1, CURVES + 1 + CURVE_ROWS * int(machine.p[CURVES].max()), CURVE_ROWS)
+        of = {int(machine.p[r + C_OF, 0]) for r in curves}
+        if lost := next((q.name for q in QUANTITIES.values() if q.of in of and q.name not in logged), None):
+            raise LogError(f"{log.path}: has no {lost}, of which a learned law of the model is a function")
+    filled = machine.usual
+    have = {**columns, "stretch": stretch, "spell": spell, "machine_spell": machine_spell}
+    have |= {"fresh": fresh.astype(float), "missing": lacking.astype(float)}
+    for name, value in filled.items():
+        if name not in have:
+            have[name] = np.full(len(t), value)
+            if name == "p_s" and machine.kind != "hydraulic":
+                continue  # a motor needs no oil
+            notes.append(
+                f"{name}: not logged; {value:g} {UNITS[name]} assumed, and effects that need it to change cannot be "
+                f"seen"
+            )
+    full = machine.table.actuator.stroke.value
+    if {"x_lvdt", "i_cmd"} <= columns.keys():
+        rough = Driven(t, have, machine, cal, (), usable, (), turns=partial(reversals, t, have["x_lvdt"], full))
+        smooth = without_noise(t, have, machine, rough.slipping(rough.signals(), machine.p))
+    if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
+        if "x_dem" in columns and not theirs:
+            law, *off = servo_law(t, have, cal, smooth, draws)
+            what = other_current(t, have, law, run, cal)
+            if what:
+                notes.append(
+                    f"i_cmd: {what}, not the mean of those since the row before, which is worked out from stroke and "
+                    f"demand"
+                )
+                columns["i_cmd"] = have["i_cmd"]
+                smooth = without_noise(t, have, machine, rough.slipping(rough.signals(), machine.p))
+                law, *off = servo_law(t, have, cal, smooth, draws)
+            sampled = what == SAMPLED
+            have["law"], have["law_error"] = law, off[1] if sampled else off[0]
+            unknown = off[0][:, 0] - off[1][:, 0] if sampled else None
+            size = cal.scalars.kp * smooth.noise
+            have["ticks"], have["other_ticks"] = (
+                between_rows(have, law, size, run, cal, unknown, seed) for seed in (0, 1)
+            )
+        have["stroke"] = smooth.stroke
+    turns: Callable[[], dict[str, Array]] = dict
+    if "x_lvdt" in columns:
+        stroke = have.get("stroke", columns["x_lvdt"])
+        turns = lru_cache(partial(reversals, t, stroke, full))
+    regimes, units = regimes_of(t, columns)
+    step = _lost_step(log, machine)
+    bits = _lost_bits(step, machine)
+    steps = {"x_lvdt": step} if step else {}
+    makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[[Driven], Stage]]] = {
+        "demand": (("n_dem", "n_r"), ("x_dem",), demand_stage),
+        "servo": (("x_dem", "x_lvdt"), ("i_cmd",), servo_stage),
+        "engine": (("n_dem",), ("n_r",), engine_stage),
+        "actuator": (("i_cmd",), ("x_lvdt",), actuator_stage),
+        "linkage": (("x_lvdt",), machine.vanes, linkage_stage),
+    }
+    if theirs:
+        cal = cal._replace(program=tables.program)
+        makers["demand"] = (("n_dem", "n_r"), ("x_dem",), own_demand_stage)
+        del makers["servo"]
+    stages, absent = [], {}
+    for name in STAGE_ORDER:
+        if name not in makers:
+            absent[name] = "a controller of your own gives its current for its own demand, not for the logged one"
+            continue
+        needs, gives, make = makers[name]
+        missing = [c for c in needs if c not in columns]
+        outputs = tuple(c for c in gives if c in columns)
+        if missing or not outputs:
+            absent[name] = "no " + ", ".join(missing or gives)
+            continue
+        if name in ("servo", "demand") and dt > 1.5 * RASTER:
+            absent[name] = f"raster of {dt:g} s; the controller works every 0.01 s"
+            continue
+        rows = law_holds if name in ("servo", "demand") else currents if name == "actuator" else machine_rows
+        driven = Driven(t, have, machine, cal, outputs, rows, present, turns=turns)
+        stage = make(driven)
+        stage.regimes, stage.regime_units = regimes, units
+        if np.isfinite(stage.measured).sum() < 300:
+            absent[name] = "fewer than 300 samples in mode RUN without gaps"
+            continue
+        if dt > 1.5 * RASTER:
+            # a corner of an input between two rows costs about as much as the corners that the doubled raster loses
+            # besides
+            coarse = make(driven.at(slice(None, None, 2), every_other(have), rows[::2]))
+            more = rms(coarse, stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0])
+            stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
+        least = LEAST_FLOOR[name]
+        if bits and "x_lvdt" in (*needs, *gives):
+            stage.coarse = {"x_lvdt": bits}
+        if name == "actuator":
+            # the error of a stage that integrates moves most: the stroke by itself, or freed of a fitted model's
+            # motion, may be quieter
+            channel = noise_floor(t, stage.measured[0])
+            freed = noise_floor(t, np.where(np.isfinite(stage.measured[0]), smooth.off, np.nan))
+            stage.quiet = np.maximum([min(channel, freed)], least)
+        stage.memory = MEMORY
+        stage.noise = lambda when, error, least=least: max(noise_floor(when, error), least)
+        stage.floor = noise_of(stage, stage.neutral())
+        stages.append(stage)
+    return Chain(t, stages, absent, columns, machine, tables, cal, notes, steps)
+
+
+def _lost_step(log: Log, machine: Plant) -> float:
+    """Step (mm) of a stroke in steps of at least four of the LVDT's converter; 0: it is not.
+
+    Steps that end in 1, 2, 2.5 or 5 are some logger's last digit and say nothing of the machine.
+    """
+    if "x_lvdt" not in log.channels:
+        return 0.0
+    x = log.channels["x_lvdt"].values
+    step = resolution(x) or resolution_before(x)
+    if step < 4.0 * _converter_step(machine):
+        return 0.0
+    digits = step / 10.0 ** np.floor(np.log10(step))
+    if np.min(np.abs(digits / np.array([1.0, 2.0, 2.5, 5.0, 10.0]) - 1.0)) < 1e-3:
+        return 0.0
+    return float(step)
+
+
+def _converter_step(machine: Plant) -> float:
+    sensors = machine.table.sensors
+    return float(sensors.lvdt_range.value / 2.0**sensors.lvdt_bits.value)
+
+
+def _lost_bits(step: float, machine: Plant) -> str:
+    """What is to be said of a stroke in such steps; "": nothing."""
+    if not step:
+        return ""
+    many = step / _converter_step(machine)
+    return f"x_lvdt comes in steps of {step:.4g} mm, {many:.0f} of its converter's: low bits are lost"

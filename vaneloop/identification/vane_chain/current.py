@@ -1,0 +1,313 @@
+"""The current of every tick: what the firmware's law makes of logged demand and stroke, and which of the ticks a log
+shows.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import lstsq
+from scipy.ndimage import convolve1d, uniform_filter1d
+
+from controller import Calibration
+from hil.figures import noise_floor, resolution
+from plant import Plant, chain, places
+from plant.parameters import NAMES, derive
+from plant.stages import actuator_run, step_currents
+from plant.stages.blocks import NOTHING
+from vaneloop.base.compiled import compiled
+from vaneloop.base.spline_rates import SplineRates
+from vaneloop.identification.subsystem import Array
+from vaneloop.identification.vane_chain.resample import RASTER, SUBSTEPS, WINDOW
+
+__all__ = [
+    "BEFORE",
+    "DRAWS",
+    "SAMPLED",
+    "SMOOTH",
+    "Smooth",
+    "between_rows",
+    "other_current",
+    "servo_law",
+    "without_noise",
+]
+
+SAMPLED = "the current of the tick at each row"
+DRAWS = 8  # of what the log hides: the integral wanders, so that one draw says little of a stretch of the log
+BEFORE = "the mean of the ten ticks before the row"
+
+
+def servo_law(
+    t: Array, c: dict[str, Array], cal: Calibration, smooth: Smooth, draws: int = DRAWS
+) -> tuple[Array, Array, Array]:
+    """What the firmware's servo loop makes of logged demand and stroke, but for a constant of its integral.
+
+    At the row it has the logged stroke with its noise; the nine ticks before it had other noise, so theirs is taken off
+    the stroke.
+
+    Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; and draws of
+    how much their mean, and the last of them, are off because not all of stroke and demand is logged, each
+    float64[rows, draws].
+    """
+    x_dem, x = c["x_dem"], c["x_lvdt"]
+    gains = (cal.scalars.kp, cal.scalars.ki, cal.scalars.kff)  # A/m = mA/mm
+    when = np.maximum(t[:, None] - RASTER + chain.TICK * np.arange(1, 11)[None], t[0])
+    stroke = np.empty(when.shape)
+    spline = SplineRates(np.arange(float(len(t))))
+    _between(smooth.stroke, spline(smooth.stroke), stroke)
+    between = stroke - np.interp(when.ravel(), t, smooth.stroke).reshape(when.shape)
+    stroke[:, -1] = x
+    law = np.empty(when.shape)
+    _loop(x_dem, stroke, *gains, law)
+    # not known: the LVDT's noise in nine ticks, what smoothing leaves at the rows, the way between them, which is known
+    # as well as a straight line and a cubic agree, and what the logged demand's last digit hides
+    draw, step = np.random.default_rng(0), resolution(x_dem)
+    of_mean, of_last = np.empty((len(t), draws)), np.empty((len(t), draws))
+    off, ticks = stroke, np.empty(when.shape)
+    for k in range(draws):
+        left = smooth.left(draw) + smooth.distortion
+        _between(left, spline(left), off)
+        off += between
+        draw.standard_normal(out=ticks)
+        ticks *= smooth.noise
+        np.subtract(ticks, off, out=off)
+        off[:, -1] = 0.0
+        _loop(-step * draw.uniform(-0.5, 0.5, len(t)), off, *gains, ticks)
+        of_mean[:, k], of_last[:, k] = ticks.mean(axis=1), ticks[:, -1]
+    return law, of_mean, of_last
+
+
+@compiled
+def _loop(demand: Array, stroke: Array, kp: float, ki: float, kff: float, out: Array) -> None:
+    """The servo loop's current at the ten ticks up to each row: its integral runs through all of them.
+
+    demand  at each row: ticks since the row before are nine of the ramp before it, then the first of the new one
+            (docs/controller.md, timing)
+    stroke  at each tick, float64[rows, 10]
+    """
+    total = 0.0
+    two = before = demand[0]
+    for m in range(len(demand)):
+        for i in range(10):
+            ramp, rate = two + (before - two) * ((i + 2) / 10.0), (before - two) / RASTER
+            if i == 9:
+                ramp, rate = before + (demand[m] - before) / 10.0, (demand[m] - before) / RASTER
+            e = ramp - stroke[m, i]
+            total += e
+            out[m, i] = kp * e + ki * total * chain.TICK + kff * rate
+        two, before = before, demand[m]
+
+
+@compiled
+def _between(x: Array, slope: Array, out: Array) -> None:
+    """A cubic spline through the rows, of these ``slope`` per row, at the ten ticks up to each row: float64[rows, 10].
+    Before the first row it is the first.
+    """
+    out[0] = x[0]
+    for m in range(1, len(x)):
+        step = x[m] - x[m - 1]
+        for i in range(10):
+            u = (i + 1) / 10.0
+            v = 1.0 - u
+            out[m, i] = x[m - 1] + u * (u * (3.0 - 2.0 * u) * step + v * (v * slope[m - 1] - u * slope[m]))
+
+
+def between_rows(
+    c: dict[str, Array], law: Array, size: float, run: Array, cal: Calibration, unknown: Array | None, seed: int
+) -> Array:
+    """Current (mA) of every tick, float64[rows, 10], whose mean over a row is the logged one.
+
+    Between two rows it is what the firmware's law makes of the stroke between them, and of the LVDT's noise in the nine
+    ticks that nobody logged: any noise of that size, for it works like dither on a valve with hysteresis or overlap.
+    Where the law does not hold (not in mode RUN, at the current's limit) the current is the row's mean.
+
+    law      of `servo_law`
+    size     mA, RMS of the LVDT's noise in the current
+    unknown  mA, such an error as the law left in each row's mean, where that was worked out from its last tick; with
+             the noise of about one tick it is added for any ``seed`` but 0
+    """
+    rng = np.random.default_rng(seed)
+    noise = rng.standard_normal(law.shape)
+    noise[:, -1] = 0.0
+    slow = uniform_filter1d(c["i_cmd"] - law.mean(axis=1), SMOOTH[-1])  # the integral's constant
+    ticks = law + slow[:, None] + size * noise
+    # the row's own tick is known; the others' noise was such that the mean comes out
+    ticks[:, :-1] += (c["i_cmd"] - ticks.mean(axis=1))[:, None] * (law.shape[1] / (law.shape[1] - 1.0))
+    alone = ~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.scalars.current_limit)
+    ticks[alone] = c["i_cmd"][alone, None]
+    if unknown is not None and seed:
+        ticks += (unknown + size * rng.standard_normal(len(law)))[:, None]
+    return np.asarray(ticks)
+
+
+def other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Calibration) -> str:
+    """Where the log's current is not the mean of the ticks since the row before, the one at the row included, put that
+    in its place.
+
+    The firmware's ``law`` on the logged stroke says which it is instead (`SAMPLED`, `BEFORE`; "": neither), and what
+    the other ticks added.
+    """
+    width = int(round(WINDOW / RASTER))
+    use = run & (np.abs(c["i_cmd"]) < 0.9e3 * cal.scalars.current_limit)
+
+    def misfit(model: Array) -> float:
+        e = np.where(use, c["i_cmd"] - model, np.nan)[: len(t) // width * width].reshape(-1, width)
+        e = e[np.isfinite(e).all(axis=1)]
+        return float(np.median(np.std(e, axis=1))) if len(e) else 0.0
+
+    mean = law.mean(axis=1)
+    others = {SAMPLED: law[:, -1], BEFORE: mean + 0.1 * (np.roll(law[:, -1], 1) - law[:, -1])}
+    what = min(others, key=lambda k: misfit(others[k]))
+    if misfit(others[what]) >= 0.9 * misfit(mean):
+        return ""
+    c["i_cmd"] = c["i_cmd"] + (mean - others[what])
+    return what
+
+
+# ---- The logged stroke with less of the LVDT's noise in it
+
+SMOOTH = (9, 15, 25, 41)  # rows over which the stroke's noise may be smoothed
+SMOOTH_ORDER = 3
+PIECE = 4_000  # rows of which one triangle is made at a time
+AROUND = 1.0  # s: over which what smoothing bends is told from noise
+LAGS = (0.01, 0.03, 0.1)  # s: lags of valve and LVDT by which the motion may trail the model's, as a sum of them
+BENDS = (0.3, 0.6, 0.85, 0.97)  # shares of the rows that move less: where the curve of flow over opening may bend
+
+
+class Smooth(NamedTuple):
+    """Stroke (mm) at the rows with less of the LVDT's noise; its RMS (mm); over how many rows it is smoothed; errors
+    (mm) such as smoothing makes; RMS (mm) of what the model of the motion is off by from row to row.
+
+    off: mm, the logged stroke less the fitted model's, whose motion is mostly gone.
+    """
+
+    stroke: Array
+    noise: float
+    rows: int
+    distortion: Array
+    uneven: Array
+    off: Array
+
+    def left(self, draw: np.random.Generator) -> Array:
+        """Error (mm) such as noise and model leave in the stroke at the rows: one draw."""
+        noise = self.noise * draw.standard_normal(len(self.off))
+        uneven = self.uneven * draw.standard_normal(len(self.off))
+        return np.asarray(_smoothed(noise, self.rows) + uneven)
+
+
+def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = NOTHING) -> Smooth:
+    """The logged stroke with less of the LVDT's noise in it: the nominal model's, plus what it is off by, smoothed.
+
+    The model takes the motion out, so that what is smoothed changes slowly; over how many rows, is decided by
+    leave-one-out errors.
+
+    known  signals of the machine's curves (`plant.curve.take`)
+    """
+    dt = float(t[1] - t[0])
+    p = machine.p.copy()
+    p[NAMES.index("actuator.stroke")] = 2e3  # the stops out of the way: a wrong null runs away in minutes
+    derive(p, dt / SUBSTEPS, dt)
+    s = np.zeros((chain.N_STATE, 1))
+    s[places.X] = s[places.X_LVDT] = s[places.READING] = 1e3
+    out = np.empty((len(t), 1))
+    n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
+    current = step_currents(c["i_cmd"] * 1e-3, dt, SUBSTEPS)
+    actuator_run(current, n_r, np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"]), dt, p, s, out,
+                 known=known)  # fmt: skip
+    step = np.diff(out[:, 0], prepend=1e3) * 1e3
+    logged = np.diff(c["x_lvdt"], prepend=c["x_lvdt"][0])
+    whole = uniform_filter1d(c["fresh"], 5) > 0.999  # rows with their neighbours
+    calibrated = _calibrated(step, dt, logged, whole)
+    model = np.cumsum(np.where(whole, calibrated, logged))  # over a gap the model goes where the stroke went
+    off = c["x_lvdt"] - model
+    tried = []
+    for rows in SMOOTH:
+        smooth, own = _smoothed(off, rows), _weights(rows)[rows // 2]
+        left = float(np.mean((off - smooth) ** 2)) / (1.0 - own)  # white noise leaves 1 - own of its power
+        tried.append((left / (1.0 - own), rows, np.sqrt(left), smooth))
+    _, rows, size, smooth = min(tried, key=lambda x: x[0])
+    noise = min(noise_floor(t, np.where(whole, off, np.nan)), size)
+    half = rows // 4 * 2 + 1
+    differs = smooth - _smoothed(off, half)
+    fast = np.abs(differs) > 2.0 * noise  # rather noisy than wrong
+    wide, narrow, as_is = _weights(rows), np.zeros(rows), np.zeros(rows)
+    narrow[(rows - half) // 2 : (rows + half) // 2] = _weights(half)
+    as_is[rows // 2] = 1.0
+    around = int(round(AROUND / dt))
+    bent = np.maximum(
+        _above_noise(differs, wide - narrow, noise, around), _above_noise(off - smooth, as_is - wide, noise, around)
+    )
+    distortion = differs * np.sqrt(bent / np.maximum(uniform_filter1d(differs**2, around), 1e-300))
+    # and what the model of the motion leaves at each row, in proportion to how fast the motion changes: least squares
+    jerky = uniform_filter1d((calibrated - uniform_filter1d(calibrated, SMOOTH[0])) ** 2, around)
+    jerky = np.maximum(jerky, 0.0)  # a running sum of squares may end a rounding below 0
+    weights = as_is - wide
+    more = (off - smooth) ** 2 - float(weights @ weights) * noise**2 - bent
+    share = max(0.0, float(more[whole] @ jerky[whole]) / max(float(jerky[whole] @ jerky[whole]), 1e-300))
+    uneven = np.sqrt(share * jerky)
+    stroke, distortion = np.where(fast, c["x_lvdt"], model + smooth), np.where(fast, off - smooth, distortion)
+    return Smooth(stroke, noise, rows, distortion, uneven, off)
+
+
+def _calibrated(step: Array, dt: float, logged: Array, whole: Array) -> Array:
+    """The model's steps (mm), with the flow of both directions as a curve, its lags and null as suit the ``logged``
+    ones best in the rows that are ``whole``.
+
+    Least squares by triangles of the rows piece by piece, which stay in the processor's cache.
+    """
+    bends = [0.0, *np.quantile(np.abs(step), BENDS)]
+    late = [_lagged(step, 1.0 - np.exp(-dt / lag)) for lag in LAGS]
+    around = np.concatenate([step[-1:], step, step[:1]])
+    pieces, triangles = [], []
+    for i in range(0, len(step), PIECE):
+        at = slice(i, i + PIECE)
+        steps = around[i : i + PIECE + 2]
+        sides = [np.maximum(side * steps - bend, 0.0) for side in (1.0, -1.0) for bend in bends]
+        shifted = [moved for side in sides for moved in (side[2:], side[1:-1], side[:-2])]
+        null = np.ones(len(shifted[0]))
+        pieces.append(np.array([*shifted, *(x[at] for x in late), null, logged[at]]))
+        triangles.append(np.linalg.qr(pieces[-1][:, whole[at]].T, mode="r"))
+    r = np.asarray(np.linalg.qr(np.concatenate(triangles), mode="r"))  # its singular values are those of all rows
+    shares = np.linalg.lstsq(r[:, :-1], r[:, -1], rcond=None)[0]
+    return np.concatenate([shares @ piece[:-1] for piece in pieces])
+
+
+# The filters of Savitzky and Golay are `scipy.signal`'s, whose import takes half a second of processor time.
+
+
+def _weights(rows: int) -> Array:
+    """Weights over ``rows`` of a cubic fitted to them, for its value in their middle."""
+    x = np.arange(rows // 2, -(rows // 2) - 1, -1.0)
+    return np.asarray(lstsq(x ** np.arange(SMOOTH_ORDER + 1)[:, None], np.eye(SMOOTH_ORDER + 1)[0])[0])
+
+
+def _smoothed(x: Array, rows: int) -> Array:
+    """A cubic fitted over ``rows`` around each row; the first and the last half of them lie on one cubic."""
+    out, half, at = np.asarray(convolve1d(x, _weights(rows), mode="constant")), rows // 2, np.arange(rows)
+    out[:half] = np.polyval(np.polyfit(at, x[:rows], SMOOTH_ORDER), at[:half])
+    out[-half:] = np.polyval(np.polyfit(at, x[-rows:], SMOOTH_ORDER), at[-half:])
+    return out
+
+
+@compiled
+def _lagged(x: Array, share: float) -> Array:
+    """A lag that goes ``share`` of the way in each row, from 0."""
+    out, y = np.empty(len(x)), 0.0
+    for k in range(len(x)):
+        y = share * x[k] - (share - 1.0) * y
+        out[k] = y
+    return out
+
+
+def _above_noise(values: Array, weights: Array, noise: float, around: int) -> Array:
+    """Mean square of ``values`` over ``around`` rows above what white noise gives them; 0 where it may be noise.
+
+    ``values`` are the logged ones under a filter of these ``weights`` w, which leaves noise^2 sum(w^2) of white noise.
+    The mean square of that scatters by sqrt(2 / around sum(rho^2)) of it, rho the autocorrelation of the weights; what
+    is above by three times as much is not noise.
+    """
+    alike = np.correlate(weights, weights, "full") / (weights @ weights)
+    chance = noise**2 * float(weights @ weights)
+    power = uniform_filter1d(values**2, around)
+    return np.where(power > chance * (1.0 + 3.0 * np.sqrt(2.0 / around * float(alike @ alike))), power - chance, 0.0)

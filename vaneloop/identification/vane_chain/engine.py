@@ -1,0 +1,55 @@
+"""Stage `engine`: rotor speed from its demand, run freely."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from plant import chain, places
+from plant.stages import engine_run
+from vaneloop.identification.subsystem import Array, Stage
+from vaneloop.identification.vane_chain.parameters import declared, lanes
+from vaneloop.identification.vane_chain.resample import RASTER, pieces_of
+from vaneloop.identification.vane_chain.subsystem_data import Driven, Made
+
+__all__ = ["engine_stage"]
+
+
+def engine_stage(driven: Driven) -> Stage:
+    """Rotor speed from its demand; the speed at the start of each stretch is what suits its first second."""
+    t, c, machine, _, outputs, run = driven[:6]
+    parameters, effects, rows, si = declared("engine", driven)
+    dt = float(t[1] - t[0])
+    n_dem = np.ascontiguousarray(c["n_dem"])
+    inner = 1
+    if dt > 1.5 * RASTER:  # between rows of a slow log the demand is taken to run straight
+        inner = int(round(dt / RASTER))
+        n_dem = np.interp(np.arange(len(t) * inner) / inner, np.arange(len(t)), n_dem)
+    signals = driven.signals()
+    between = np.repeat(signals, inner, axis=1)
+    pieces = pieces_of(c["stretch"])
+    second = max(1, int(round(1.0 / dt)))
+
+    def simulate(thetas: Array) -> Array:
+        p = lanes(driven, thetas, rows, si)
+        s = np.zeros((chain.N_STATE, len(thetas)))
+        out = np.empty((len(n_dem), len(thetas)))
+        slipped = driven.slipping(signals, p)
+        known = between if slipped is signals else np.repeat(slipped, inner, axis=1)
+        for piece in pieces:
+            head = min(piece.start + second, piece.stop)
+            start = np.full(len(thetas), np.median(c["n_r"][piece][:5]))
+            # at its rate limit the engine never forgets how it began: the speed at the start is what suits the first
+            # second
+            for stop in (head, piece.stop):
+                inside = slice(piece.start * inner, stop * inner)
+                s[places.N_R] = start
+                engine_run(n_dem[inside], dt / inner, p, s, out[inside], np.ascontiguousarray(known[:, inside]))
+                start = start + np.mean(
+                    c["n_r"][piece.start : head, None] - out[piece.start * inner : head * inner : inner], axis=0
+                )
+        return out[::inner].T[:, None, :]
+
+    measured = np.where(run, c["n_r"], np.nan)[None]
+    stage = Stage("engine", outputs, ("%",), parameters, effects, simulate, t, measured)
+    stage.made = Made(engine_stage, driven)
+    return stage

@@ -1,0 +1,91 @@
+"""Stage `linkage`: the vane angles from the stroke, jointly, run freely; the play is a state."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from plant.parameters import derive
+from plant.stages import linkage_run
+from plant.stages.linkage import speed_reach
+from vaneloop.identification.subsystem import Array, Named, Stage
+from vaneloop.identification.vane_chain.parameters import declared, lanes, like_temperature, like_time
+from vaneloop.identification.vane_chain.resample import SETTLE, pieces_of, since
+from vaneloop.identification.vane_chain.subsystem_data import Driven, Made, excerpts
+
+__all__ = ["linkage_stage"]
+
+
+def linkage_stage(driven: Driven) -> Stage:
+    """Vane angles that the log has, from the stroke."""
+    t, c, machine, _, outputs, run = driven[:6]
+    parameters, effects, rows, si = declared("linkage", driven)
+    signals = driven.signals()
+    dt = float(t[1] - t[0])
+    x = np.ascontiguousarray(c.get("stroke", c["x_lvdt"]) * 1e-3)
+    n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
+    t_oil = np.ascontiguousarray(c["t_oil"])
+    which = [machine.vanes.index(o) for o in outputs]
+    first = [float(np.deg2rad(np.median(c[o][:5]))) if o in c else np.nan for o in machine.vanes]
+
+    def simulate(thetas: Array, t: Array = t, t_oil: Array = t_oil) -> Array:
+        p = lanes(driven, thetas, rows, si)
+        derive(p, dt, dt)
+        start = machine.start(stroke=x[0], n_r=n_r[0])
+        machine.place_rings(start, tuple(first))
+        s = np.repeat(start, len(thetas), axis=1)
+        out = np.empty((len(thetas), len(first), len(t)))
+        linkage_run(x, n_r, t_oil, t, dt, p, s, out.transpose(2, 1, 0), driven.slipping(signals, p))
+        out = out if which == list(range(len(first))) else out[:, which]
+        return np.asarray(np.rad2deg(out, out=out))
+
+    # until the stroke has crossed the play twice over, nobody knows where in it the rings started; nor where they were
+    # left at full speed by a controller that had to catch up, which turns between two rows
+    first_spell, settled = c["machine_spell"] == c["machine_spell"][0], since(t, c["machine_spell"]) >= SETTLE
+    known = np.zeros(len(t), dtype=bool)
+    for piece in pieces_of(c["machine_spell"]):
+        counts = np.flatnonzero((first_spell | settled)[piece]) + piece.start
+        known[counts] = _crossed(c["x_lvdt"][counts])
+    moved = known.any()
+    if moved:
+        run = run & known
+    measured = np.array([np.where(run, c[o], np.nan) for o in outputs])
+    stage = Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, simulate, t, measured)
+    stage.alike = {"pot_gain": _cross_talk}
+    ageing, warming = like_time(t, t_oil), like_temperature(t, t_oil)
+    stage.twins = {
+        "linkage_wear": ("oil temperature", lambda thetas: simulate(thetas, t=warming)),
+        **{
+            name: ("time", lambda thetas: simulate(thetas, t_oil=ageing))
+            for name in ("thermal_growth", "lvdt_thermal_drift")
+        },
+    }
+
+    def kept(at: Array) -> Array:
+        keep, last = run[at], speed_reach(dt)
+        for piece in np.split(np.arange(len(at)), np.flatnonzero(np.diff(at) != 1) + 1):
+            if moved:
+                keep[piece] &= _crossed(c["x_lvdt"][at[piece]])
+            if at[piece[-1]] < len(t) - 1:  # the stroke's speed there is that of a leap to the next piece
+                keep[piece[-last:]] = False
+        return keep
+
+    stage.counted = kept
+    stage.excerpt, stage.made = excerpts(linkage_stage, driven, stage, kept), Made(linkage_stage, driven)
+    return stage
+
+
+def _crossed(x: Array) -> Array:
+    """Samples from which on the stroke x (mm) has crossed any ring's play: where in it the ring began is forgotten."""
+    return np.asarray(np.maximum.accumulate(x) - np.minimum.accumulate(x) > 3.0)
+
+
+def _cross_talk(named: Named) -> str:
+    """The stages turn together: a share of another's reading is a gain and an offset to 1 %."""
+    changed = {
+        effect: {v for v, p in named[effect].items() if not p["low"] <= none <= p["high"]}
+        for effect, none in (("pot_gain", 1.0), ("pot_bias", 0.0))
+        if effect in named
+    }
+    gains = changed["pot_gain"]
+    one = len(gains) == 1 and gains <= changed.get("pot_bias", set())
+    return "a share of another stage's reading" if one else ""

@@ -1,0 +1,258 @@
+"""A log of the vanes on one raster: 10 ms, the ECU frame's period, or the log's own where that is slower; which rows
+count; and the conditions under which a stage may fail.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from hil.logs import Channel, Log, LogError
+from hil.logs.held import COMMANDS, answers, held, taken
+from vaneloop.base.compiled import compiled
+from vaneloop.base.sizes import no_smaller
+from vaneloop.identification.subsystem import Array, Stage
+
+__all__ = [
+    "RASTER",
+    "SETTLE",
+    "SUBSTEPS",
+    "WINDOW",
+    "Grid",
+    "every_other",
+    "grid_of",
+    "lately",
+    "no_gap_in_window",
+    "on_raster",
+    "pieces_of",
+    "regimes_of",
+    "rms",
+    "since",
+    "stretches",
+]
+
+RASTER = 1e-2  # s
+WINDOW = 1.0  # s
+SUBSTEPS = 5  # of the actuator between two samples of 10 ms
+SETTLE = 3.0  # s at the start of a log that do not count: filters, lags and play forget how they started
+
+
+class Grid(NamedTuple):
+    """The raster of a log.
+
+    start, dt, rows  s of the log's own time, s, number of rows
+    steps            usual time between two samples of each channel, s
+    """
+
+    start: float
+    dt: float
+    rows: int
+    steps: Mapping[str, float]
+
+    @property
+    def window(self) -> int:
+        """Rows of a window of the stages that integrate."""
+        return max(1, round(WINDOW / self.dt))
+
+
+def grid_of(log: Log) -> Grid:
+    """The raster of a log: from where all channels have begun to where the first of them ends."""
+    channels = log.channels
+    times = {id(c.t): c.t for c in channels.values()}  # channels of a table share one
+    known = {i: float(np.median(np.diff(t))) if len(t) > 1 else np.inf for i, t in times.items()}
+    steps = {name: known[id(c.t)] for name, c in channels.items()}
+    usual = [steps[name] for name, c in channels.items() if len(c.t) > 10]
+    if not usual:
+        raise LogError(f"{log.path}: no channel has more than 10 samples")
+    dt = max(RASTER, round(float(np.median(usual)) / RASTER) * RASTER)
+    start = max(c.t[0] for c in channels.values() if len(c.t) > 10)
+    end = min(c.t[-1] for c in channels.values() if len(c.t) > 10)
+    start += _to_frame(channels, steps, start, dt)
+    return Grid(start, dt, max(1, int((end - start) / dt + 1e-6) + 1), steps)
+
+
+def on_raster(
+    log: Log, grid: Grid, pieces: Sequence[tuple[int, int]] = ()
+) -> tuple[Array, dict[str, Array], Array, Array, list[str]]:
+    """All channels on one uniform raster; which samples are near measured ones; at which some channel misses a row of
+    its own; notes.
+
+    pieces  (first row, row behind the last), ascending, in whole windows: only these rows of a long log, each piece as
+            behind a gap; all on the raster of the whole log. Default: all rows
+
+    Where commands came in frames, a row is a tick of the controller: what it sent then, with the commands that it had.
+    """
+    if not pieces:
+        t = np.arange(grid.rows) * grid.dt
+        return t, *_columns(log.channels, grid, t), list(log.notes)
+    parts = []
+    for first, behind in pieces:
+        t = np.arange(first, behind) * grid.dt
+        low, high = (grid.start + k * grid.dt for k in (first - grid.window, behind + grid.window))
+        parts.append((t, *_columns({k: _between(c, low, high) for k, c in log.channels.items()}, grid, t)))
+    times, columns, fresh, missing = zip(*parts, strict=True)
+    for before, after in itertools.pairwise(fresh):  # a smoothing filter, or a spline, looks across the border
+        before[-1] = after[0] = False
+    joined = {name: np.concatenate([c[name] for c in columns]) for name in log.channels}
+    return np.concatenate(times), joined, np.concatenate(fresh), np.concatenate(missing), list(log.notes)
+
+
+def _between(c: Channel, low: float, high: float) -> Channel:
+    """The samples between two times, and the next one on either side."""
+    use = slice(max(int(np.searchsorted(c.t, low)) - 1, 0), int(np.searchsorted(c.t, high)) + 1)
+    return Channel(c.t[use], c.values[use], c.framed)
+
+
+def _columns(channels: Mapping[str, Channel], grid: Grid, t: Array) -> tuple[dict[str, Array], Array, Array]:
+    """`on_raster` at rows ``t`` (s from its start): channels, which rows are fresh, at which one is missing."""
+    dt, first = grid.dt, grid.start
+    reference = answers(channels) or max((c for c in channels.values()), key=lambda c: len(c.t))
+    own = float(np.median(np.diff(reference.t)))
+    phase = float(np.median((reference.t - first + 0.5 * own) % own) - 0.5 * own) if own >= 0.5 * dt else 0.0
+    when = t + first + phase
+    had = taken(channels, when, 0.5 * dt)
+    fresh, missing = np.ones(len(t), dtype=bool), np.zeros(len(t), dtype=bool)
+    columns = {}
+    for name, c in channels.items():
+        if len(c.t) < 2:
+            columns[name] = np.full(len(t), c.values[0] if len(c.t) else np.nan)
+            continue
+        step = grid.steps[name]
+        if name in COMMANDS and c.framed:
+            i = held(c, had)
+            columns[name], age = c.values[i], had - c.t[i]
+            fresh &= age < 3.0 * max(step, dt)  # two frames are bridged, as two rows are below
+            lost = np.append(np.diff(c.t), step) > 1.5 * max(step, dt)
+            missing |= lost[i] & (age > 0.75 * step)
+            continue
+        uniform = np.abs(np.diff(c.t) - step) < 0.3 * step
+        if name == "i_cmd" and step < 0.6 * dt:
+            total = np.concatenate([[0.0], np.cumsum(c.values)])
+            edge = np.searchsorted(c.t, np.concatenate([[when[0] - dt], when]) + 0.5 * step)
+            count = np.maximum(np.diff(edge), 1)
+            columns[name] = np.diff(total[edge]) / count
+        elif (
+            uniform.mean() > 0.98 and abs(step - dt) < 0.02 * dt or name in ("n_dem", "x_dem", "state")
+            or _held(c, step, dt)
+        ):  # fmt: skip
+            # rows of a regular logger: the nearest row, whatever its clock's jitter; commands and what comes in frames
+            # hold their value
+            i = np.clip(np.searchsorted(c.t, when + 0.5 * step) - 1, 0, len(c.t) - 1)
+            columns[name] = c.values[i]
+        else:
+            columns[name] = np.interp(when, c.t, c.values)
+        i = np.clip(np.searchsorted(c.t, when), 1, len(c.t) - 1)
+        away = np.minimum(np.abs(c.t[i] - when), np.abs(when - c.t[i - 1]))
+        fresh &= away < 1.5 * max(step, dt)  # one or two rows are bridged, more are a gap
+        missing |= away > 0.75 * max(step, dt)
+    return {name: no_smaller(v) for name, v in columns.items()}, fresh, missing
+
+
+def _held(c: Channel, step: float, dt: float) -> bool:
+    """Whether the channel is logged faster than the raster and yet holds its value for rows: it came in frames."""
+    return bool(step < 0.6 * dt and np.count_nonzero(np.diff(c.values)) < 0.3 * len(c.t))
+
+
+def _to_frame(channels: Mapping[str, Channel], steps: Mapping[str, float], start: float, dt: float) -> float:
+    """Return the time from ``start`` to the controller's next frame, as the commands in a log faster than the frames
+    show it; else 0.
+    """
+    for name in ("x_dem", "n_dem"):
+        if name in channels and _held(channels[name], steps[name], dt):
+            c = channels[name]
+            turn = np.exp(2j * np.pi * (c.t[1:][np.diff(c.values) != 0.0] - start) / dt)
+            if len(turn) > 20 and abs(turn.mean()) > 0.5:
+                return float(np.angle(turn.mean()) / (2.0 * np.pi) % 1.0 * dt)
+    return 0.0
+
+
+def every_other(columns: dict[str, Array]) -> dict[str, Array]:
+    """Every other row; of the current, which is a mean since the row before, the mean of two."""
+    out = {k: v[::2] for k, v in columns.items()}
+    if "i_cmd" in columns:
+        i = columns["i_cmd"]
+        out["i_cmd"] = np.concatenate([i[:1], 0.5 * (i[1:-1:2] + i[2::2])])
+    return out
+
+
+def rms(stage: Stage, difference: Array) -> Array:
+    """RMS of a difference of outputs where the stage counts them, its windows' constants free: float64[outputs]."""
+    e = np.where(np.isfinite(stage.measured), difference, np.nan)
+    if stage.window:
+        w = int(round(stage.window / (stage.t[1] - stage.t[0])))
+        e = e[:, : e.shape[1] // w * w].reshape(len(e), -1, w)
+        e = (e - e.mean(axis=2, keepdims=True)).reshape(len(e), -1)
+    return np.asarray(np.sqrt(np.nansum(e**2, axis=1) / np.maximum(np.isfinite(e).sum(axis=1), 1)))
+
+
+def stretches(good: Array) -> Array:
+    """Number of the stretch of good rows that each row belongs to, from 0; a row that is not good belongs to the
+    stretch before it.
+    """
+    begins = good & ~np.concatenate([[False], good[:-1]])
+    begins[0] = False
+    return np.cumsum(begins)
+
+
+def since(t: Array, stretch: Array) -> Array:
+    """Time since the first row of each row's stretch, s."""
+    return np.asarray(t - t[np.searchsorted(stretch, stretch)])
+
+
+def pieces_of(stretch: Array) -> list[slice]:
+    """Rows of each stretch."""
+    edges = [0, *(np.flatnonzero(np.diff(stretch)) + 1).tolist(), len(stretch)]
+    return [slice(a, b) for a, b in itertools.pairwise(edges)]
+
+
+def no_gap_in_window(t: Array, fresh: Array) -> Array:
+    """Rows of windows that have only good rows."""
+    w = (t / WINDOW).astype(int)
+    bad = np.unique(w[~fresh])
+    return ~np.isin(w, bad)
+
+
+def lately(rows: Array, seconds: float, dt: float = RASTER) -> Array:
+    """Whether any of these rows, ``dt`` (s) apart, was less than some seconds ago."""
+    n = np.arange(len(rows))
+    return np.asarray(n - np.maximum.accumulate(np.where(rows, n, -len(rows))) < seconds / dt)
+
+
+def regimes_of(t: Array, columns: dict[str, Array]) -> tuple[dict[str, Array], dict[str, str]]:
+    """Conditions under which a stage may fail."""
+    out: dict[str, Array] = {"time": t}
+    units = {"time": "s"}
+    dt = t[1] - t[0]
+    if "x_lvdt" in columns:
+        x = columns["x_lvdt"]
+        k = max(3, int(round(0.1 / dt)))
+        smooth = np.convolve(np.pad(x, k, mode="edge"), np.ones(2 * k + 1) / (2 * k + 1), mode="valid")
+        v = np.gradient(smooth, dt)
+        out |= {"stroke": x, "stroke speed": v, "direction": np.sign(np.where(np.abs(v) > 0.2, v, 0.0))}
+        units |= {"stroke": "mm", "stroke speed": "mm/s", "direction": ""}
+        out["distance since reversal"], units["distance since reversal"] = _since_reversal(smooth, v), "mm"
+    for name, label, unit in (
+        ("n_r", "rotor speed", "%"),
+        ("t_oil", "oil temperature", "degC"),
+        ("p_s", "supply pressure", "MPa"),
+    ):
+        if name in columns:
+            out[label], units[label] = columns[name], unit
+    if "i_cmd" in columns:
+        out["current"], units["current"] = columns["i_cmd"], "mA"
+    return out, units
+
+
+@compiled
+def _since_reversal(x: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Way since the stroke ``x`` (mm) turned, mm; ``v``: its speed, which below 0.2 mm/s turns nothing."""
+    out = np.zeros(len(x))
+    last, sign = x[0], 0.0
+    for i in range(1, len(x)):
+        if abs(v[i]) > 0.2 and np.sign(v[i]) != sign:
+            sign, last = np.sign(v[i]), x[i]
+        out[i] = abs(x[i] - last)
+    return out

@@ -1,0 +1,384 @@
+"""Compare, diagnose and extend over all stages of a model, and the JSON of it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from vaneloop.identification.least_squares.problem import Fit, Judge, recalibrate
+from vaneloop.identification.regimes import Located, Shape, StageFigures, agrees, locate, shape
+from vaneloop.identification.results import StageDiagnosis, parameters_of, recalibrated, rms_per_output, weigh
+from vaneloop.identification.selection.diagnosis import Judged, diagnose_stage, extend_stage, floor_of
+from vaneloop.identification.selection.likelihood_acceptance import (
+    NATS,
+    NoiseFloor,
+    as_close,
+    correlation_of,
+    significant,
+)
+from vaneloop.identification.subsystem import Stage, StageError
+
+__all__ = [
+    "Diagnosis", "News", "StageError", "StageFigures", "as_compared", "compare_stages", "diagnose", "diagnosis_json",
+    "extend_stage", "floor_of", "locate_stages", "no_better", "verdict_of",
+]  # fmt: skip
+
+
+@dataclass(eq=False)
+class Diagnosis:
+    """What all stages say together."""
+
+    verdict: str
+    stages: list[StageDiagnosis]
+    shapes: dict[str, list[Shape]]
+    not_observed: dict[str, str]
+    elapsed_s: float
+    notes: list[str] = field(default_factory=list)
+
+
+def locate_stages(stages: Sequence[Stage], progress: Callable[[float, str], None] | None = None) -> list[Located]:
+    """Every stage with nothing added, driven by its own logged inputs: how large its error is, and under which
+    conditions.
+    """
+    out = []
+    for i, stage in enumerate(stages):
+        if progress:
+            progress(i / len(stages), stage.name)
+        out.append(locate(Judge(stage, floor_of(stage))))
+    return out
+
+
+def compare_stages(stages: Sequence[Stage]) -> list[StageFigures]:
+    """Error of every output of every stage, driven by its own logged inputs, with nothing added."""
+    return [figures for located in locate_stages(stages) for figures in located.signals]
+
+
+@dataclass(frozen=True, eq=False)
+class News:
+    """How far a search is.
+
+    fraction  done, as far as that can be known: a search ends when nothing more earns its place
+    text      what is being tried
+    found     what a stage says, as soon as it is searched; the other stages may still correct it (`diagnose`)
+    """
+
+    fraction: float
+    text: str
+    found: StageDiagnosis | None = None
+
+
+OFTEN = 0.1  # s between two looks at searches in other processes
+SHORT = 10  # times smaller than the longest search: takes next to nothing
+USUAL = 60.0  # fits after which half of a stage's search is usually done
+
+_WORK: list[Stage] = []
+_FITS: list[Any] = []  # of the work: a number that all processes see, fits made by each stage
+_JUDGED: list[Judged] = [NoiseFloor]  # of the work
+
+
+def _one(i: int, tell: Callable[[], None] | None = None) -> tuple[StageDiagnosis, list[Shape]]:
+    stage = _WORK[i]
+
+    def tick() -> None:
+        _FITS[i].value += 1  # one process writes each
+        if tell:
+            tell()
+
+    d = as_compared(stage, diagnose_stage(stage, floor_of(stage), tick=tick, judged=_JUDGED[0]))
+    if d.verdict == "none" and d.criterion == "noise_floor":
+        d = _under_every_condition(stage, d)
+    return d, shape(Judge(stage, d.floor), d.final) if _leaves(d) else []
+
+
+def _under_every_condition(stage: Stage, d: StageDiagnosis) -> StageDiagnosis:
+    """The answer "none", or "unknown" where `locate` finds a condition under which the stage fails: over the whole log
+    little is above the noise, in one place it is.
+    """
+    hot = locate(Judge(stage, d.floor), d.final).hot
+    return replace(d, verdict="unknown", refused=[f"fails at {hot[0].worst()}"]) if hot else d
+
+
+def as_compared(stage: Stage, d: StageDiagnosis) -> StageDiagnosis:
+    """The diagnosis with the error before as `compare_stages` has it, where a search has begun anew with a lower noise
+    floor.
+    """
+    floor = floor_of(stage)
+    if not np.array_equal(d.floor, floor):
+        judge = Judge(stage, floor)
+        d.base = recalibrate(judge)
+        d.error_before = rms_per_output(judge, d.base)
+        if not d.final.effects:
+            d.final, d.error_after = d.base, d.error_before
+    return d
+
+
+def _leaves(d: StageDiagnosis) -> bool:
+    """Whether what is left asks for words: something is missing, or still missing."""
+    return d.verdict == "unknown" or (d.verdict != "none" and not agrees(d.excess, 1.0))
+
+
+def diagnose(
+    stages: Sequence[Stage],
+    not_observed: dict[str, str] | None = None,
+    progress: Callable[[float], None] | None = None,
+    workers: int = 2,
+    judged: Judged = NoiseFloor,
+    news: Callable[[News], None] | None = None,
+) -> Diagnosis:
+    """Search every stage for missing effects; stages run side by side in ``workers`` processes where the system can
+    fork.
+
+    judged    what an effect must do to be named
+    progress  takes the fraction done
+    news      takes that too, with what is being tried and what each stage says as soon as it is searched
+    """
+    started = time.perf_counter()
+    _WORK[:], _JUDGED[:] = list(stages), [judged]
+    _FITS[:] = [multiprocessing.RawValue("l", 0) for _ in _WORK]
+    side_by_side = workers > 1 and len(_WORK) > 1 and hasattr(os, "fork")
+    order = _order(_WORK, side_by_side)
+    done: dict[int, tuple[StageDiagnosis, list[Shape]]] = {}
+
+    def tell(found: StageDiagnosis | None = None) -> None:
+        told = News(*_how_far(set(done)), found)
+        if progress:
+            progress(told.fraction)
+        if news:
+            news(told)
+
+    if side_by_side:
+        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("fork")) as pool:
+            open_jobs = {pool.submit(_one, i): i for i in order}
+            while open_jobs:
+                ended, _ = wait(open_jobs, OFTEN if news or progress else None, FIRST_COMPLETED)
+                for job in ended:
+                    i = open_jobs.pop(job)
+                    done[i] = job.result()
+                    tell(done[i][0])
+                if not ended:
+                    tell()
+    else:
+        for i in order:
+            done[i] = _one(i, tell)
+            tell(done[i][0])
+    results = [done[i][0] for i in range(len(_WORK))]
+    _agree({s.name: s for s in stages}, results)
+    for d in results:
+        weigh(d)
+    shapes = {done[i][0].stage: done[i][1] for i in range(len(_WORK)) if done[i][1]}
+    return Diagnosis(verdict_of(results), results, shapes, dict(not_observed or {}), time.perf_counter() - started)
+
+
+def verdict_of(results: Sequence[StageDiagnosis]) -> str:
+    """What all stages say together."""
+    verdicts = {d.verdict for d in results}
+    return "missing" if "missing" in verdicts else "unknown" if "unknown" in verdicts else "none"
+
+
+def _order(stages: Sequence[Stage], side_by_side: bool) -> list[int]:
+    """Stages in the order in which they are searched: those that take next to nothing, so that something is found at
+    once, then the longest. Side by side with others the longest of all begins: the end waits for it.
+    """
+    size = [len(s.effects) * len(s.outputs) for s in stages]
+    by_size = sorted(range(len(stages)), key=lambda i: size[i])
+    short = [i for i in by_size if SHORT * size[i] < size[by_size[-1]]]
+    out = [*short, *(i for i in reversed(by_size) if i not in short)]
+    return sorted(out, key=lambda i: i != by_size[-1]) if side_by_side else out
+
+
+def _how_far(done: set[int]) -> tuple[float, str]:
+    """Fraction of the search that is done, and what is being tried: nobody knows how many fits there will be."""
+    size = [max(1, len(s.effects)) * len(s.outputs) for s in _WORK]
+    fits = [n.value for n in _FITS]
+    share = [1.0 if i in done else fits[i] / (fits[i] + USUAL) for i in range(len(_WORK))]
+    at_work = [
+        f"{_WORK[i].name} ({len(_WORK[i].effects)} effects, {fits[i]} fits)"
+        for i in range(len(_WORK))
+        if i not in done and fits[i]
+    ]
+    text = f"{len(done)} of {len(_WORK)} stages searched" + (f"; trying {', '.join(at_work)}" if at_work else "")
+    return sum(a * b for a, b in zip(share, size, strict=True)) / sum(size), text
+
+
+def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
+    """Let the stages settle each other's answers: an effect that acts in two stages must do so in both by the same
+    amount.
+
+    Among an effect and its rivals those go that another stage contradicts; those stay alone that another stage names
+    too. Where all of them are contradicted, with any size near theirs, the next best of those that were tried takes the
+    place if it explains as much; else the stage's answer is "unknown".
+    """
+    for d in results:
+        judge = Judge(stages[d.stage], d.floor)
+        for k, f in enumerate(d.effects):
+            elsewhere = {
+                m: [o for o in results if o is not d and o.verdict != "unknown" and m in stages[o.stage].index()]
+                for m in f.fits
+            }
+            options = [f.effect, *f.rivals]
+            left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m, _doubt(o, m)) for o in elsewhere[m])]
+            if not left:
+                left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m, NEAR) for o in elsewhere[m])]
+            beside = {
+                g.effect: d.final for g in d.effects if g is not f
+            }  # they may have changed since the rivals were fitted
+            refitted: dict[str, Fit] = {}
+            for m in () if left else sorted((m for m in f.shares if m not in options), key=lambda m: -f.shares[m]):
+                if all(_fits(stages, d, f.fits[m], o, m) for o in elsewhere[m]):
+                    refitted[m] = _with(
+                        judge, {**beside, m: f.fits[m]}
+                    )  # where an excerpt was searched, to the whole log now
+                    if as_close(judge, d, refitted[m]):
+                        left = [m]
+                        break
+            if not left:
+                d.verdict, d.nearest, d.effects = "unknown", options[:3], []
+                d.refused = [f"{m} is contradicted by {elsewhere[m][0].stage}" for m in options if elsewhere[m]]
+                break
+            seconded = [m for m in left if any(m in (g.effect, *g.rivals) for o in elsewhere[m] for g in o.effects)]
+            left = seconded or left
+            if left == options:
+                continue
+            name, fit = left[0], d.final
+            if name != f.effect:
+                fit = refitted.get(name) or _with(judge, {**beside, name: f.fits[name]})
+                d.final, d.error_after = fit, rms_per_output(judge, fit)
+                d.recalibrated = recalibrated(stages[d.stage], fit)
+                for other in d.effects:
+                    if other is not f:
+                        other.parameters = parameters_of(stages[d.stage], fit, other.effect)
+            shares = {m: v for m, v in f.shares.items() if m in left or m not in options}  # the others are refuted
+            whole = max(sum(shares.values()), 1e-300)
+            d.effects[k] = replace(
+                f, effect=name, rivals=left[1:], shares={m: v / whole for m, v in shares.items()},
+                parameters=parameters_of(stages[d.stage], fit, name),
+            )  # fmt: skip
+
+
+def _doubt(other: StageDiagnosis, effect: str) -> float:
+    """By what share of its size a stage that names an effect too may be wrong about it: errors of form are its own."""
+    return NEAR if any(effect in (g.effect, *g.rivals) for g in other.effects) else 0.0
+
+
+NEAR = 0.5  # share of its size by which a stage may be wrong about an effect that another stage sees too
+
+
+def _with(judge: Judge, sources: dict[str, Fit]) -> Fit:
+    """Fit exactly these effects, each started from its size in the fit given; the last one's nominal parameters too."""
+    index, start = judge.stage.index(), judge.stage.neutral()
+    for name, fit in sources.items():
+        nominal = slice(len(judge.stage.parameters))
+        start[nominal], start[index[name]] = fit.theta[nominal], fit.theta[index[name]]
+    return judge.fit(tuple(sources), start, 4)
+
+
+def _fits(
+    stages: dict[str, Stage], d: StageDiagnosis, fit: Fit, other: StageDiagnosis, effect: str, near: float = 0.0
+) -> bool:
+    """Whether the effect may have the size that stage ``d`` gives it, within its interval, in the stage ``other`` too.
+
+    near  share of its size by which the interval is widened
+    """
+    stage = stages[other.stage]
+    mine, theirs = stages[d.stage].index()[effect], stage.index()[effect]
+    at = [int(np.flatnonzero(fit.free == c)[0]) for c in range(mine.start, mine.stop)]
+    there, turns = other.final.theta[theirs].copy(), [p.period for p in stage.effect(effect).parameters]
+    for i, turn in enumerate(turns):
+        if turn:
+            there[i] += turn * np.round((fit.theta[mine][i] - there[i]) / turn)
+    wider = near * np.abs(fit.theta[mine] - stages[d.stage].neutral()[mine])
+    size = np.clip(there, fit.low[at] - wider, fit.high[at] + wider)
+    if np.array_equal(size, there):
+        return True
+    judge = Judge(stage, other.floor)
+    start = other.final.theta.copy()
+    start[theirs] = size
+    held = judge.fit(tuple(e for e in other.final.effects if e != effect), start, 6)
+    return not significant(judge, held, other.final, correlation_of(judge, other.final))
+
+
+def no_better(r: StageDiagnosis) -> str | None:
+    """Say in one line that the effects of `extend_stage` do not bring the model nearer to the log;
+    None: they do.
+
+    Errors are held-out; on the data that it was fitted to, a model with more effects is never farther off.
+    """
+    before = r.steps[0][1]
+    if not r.final.effects or r.excess < before:
+        return None
+    on_bound = [
+        f"{f.effect} {n}" for f in r.effects for n, p in f.parameters.items() if p["low"] == p["value"] == p["high"]
+    ]
+    why = f"; on a bound or neutral: {', '.join(on_bound)}" if on_bound else ""
+    return (
+        f"{r.stage}: {', '.join(r.final.effects)} takes the error from {before:.4g} to {r.excess:.4g} noise "
+        f"floors, no better{why}"
+    )
+
+
+def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
+    """Return the diagnosis as the JSON of the command."""
+    stages, effects, recalibrated, unknown, unobservable = [], [], [], [], []
+    for s in d.stages:
+        for k in range(len(s.floor)):
+            stages.append(
+                {
+                    "stage": s.stage,
+                    "verdict": s.verdict,
+                    "signal": s.outputs[k],
+                    "unit": s.units[k],
+                    "error_before": float(s.error_before[k]),
+                    "error_after": float(s.error_after[k]),
+                    "noise_floor": float(s.floor[k]),
+                }
+            )
+        for f in s.effects:
+            effects.append(
+                {
+                    "effect": f.effect, "stage": s.stage, "probability": f.probability, "parameters": f.parameters,
+                    "rivals": f.rivals,
+                    "inseparable": f.inseparable, "probabilities": f.probabilities, "evidence": f.evidence,
+                }
+            )  # fmt: skip
+        recalibrated += s.recalibrated
+        if _leaves(s):
+            text = "; ".join(x.text for x in d.shapes.get(s.stage, [])) or "no shape found"
+            text = "; ".join([text, *s.refused])
+            leaning = s.nearest or [c.effect for c in s.candidates if c.nats > NATS][:3]
+            unknown.append({"stage": s.stage, "shape": text, "nearest_effects": leaning})
+        unobservable += [{"effect": c.effect, "stage": s.stage, "needs": c.reason} for c in s.candidates if c.reason]
+    for name, why in d.not_observed.items():
+        stages.append(
+            {
+                "stage": name, "verdict": "not_observed", "signal": None, "unit": None, "error_before": None,
+                "error_after": None,
+                "noise_floor": None, "reason": why,
+            }
+        )  # fmt: skip
+    effects.sort(key=lambda e: -float(str(e["probability"])))
+    # an effect that shows in two stages is one effect: the stage where it gains most speaks for it
+    best: dict[str, tuple[float, str]] = {}
+    for s in d.stages:
+        for f in s.effects:
+            if f.effect not in best or f.nats > best[f.effect][0]:
+                best[f.effect] = (f.nats, s.stage)
+    effects = [e for e in effects if best[str(e["effect"])][1] == e["stage"]]
+    return {
+        "schema": 1,
+        "log": log,
+        "verdict": d.verdict,
+        "stages": stages,
+        "effects": effects,
+        "recalibrated": recalibrated,
+        "unknown": unknown,
+        "not_observable": unobservable,
+        "notes": d.notes,
+        "elapsed_s": d.elapsed_s,
+    }
