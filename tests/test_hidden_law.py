@@ -29,7 +29,7 @@ from vaneloop.identification import Parameter
 from vaneloop.identification.candidates import laws
 from vaneloop.identification.candidates.library import LAWS
 from vaneloop.identification.user_models import simulation as runner
-from vaneloop.identification.user_models.bound_system import Bound
+from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.kernel import build_kernels
 from vaneloop.verbs import search
 
@@ -71,7 +71,7 @@ def records(case: Case) -> list[Record]:
     return [Record("log", log.t, columns)]
 
 
-def apart(case: Case, bound: Bound, with_law: bool) -> np.ndarray:
+def apart(case: Case, bound: BoundSystem, with_law: bool) -> np.ndarray:
     """RMS between the product's model and the truth in noise floors, output by output."""
     theta = bound.stage.neutral()
     for h in case.hidden if with_law else ():
@@ -91,14 +91,14 @@ EVERY = [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in F
 def test_the_product_with_the_true_law_is_the_truth(name: str) -> None:
     f = FAMILIES[name]
     far: dict[str, str] = {}
-    first: Bound | None = None
+    first: BoundSystem | None = None
     for law in ("", *f.laws):
         hidden = [law] if law and law not in f.partners else [f.partners[law], law] if law else []
         case = draw_case(1, 3, (name,), names=hidden, samples=4 * SAMPLES if f.window else SAMPLES)
         system = first.system if first else exact(nominal(f, case.values, {}), case)
         rng = np.random.default_rng([1, 3])
         for _ in range(20):  # other sizes, until the law shows
-            bound = system.bind(records(case), like=first)
+            bound = BoundSystem(system, records(case), like=first)
             first = first or bound
             if law.rpartition(".")[2] in SWITCHES and f.kind == "simulate":
                 bound.runner.steps = STEPS
@@ -484,7 +484,7 @@ def test_a_rescaled_model_says_the_same_in_other_units(name: str) -> None:
     f = FAMILIES[name]
     case = draw_case(1, 3, (name,), names=[], samples=200)
     logs = [Record(f"log {k}", log.t, case.columns(k)) for k, log in enumerate(case.logs)]
-    plain_bound = exact(nominal(f, case.values, {}), case).bind(logs[:-1])
+    plain_bound = BoundSystem(exact(nominal(f, case.values, {}), case), logs[:-1])
     want = plain_bound.run(plain_bound.stage.neutral()[None])[0]
     seen = set()
     for what, (system, fitted, test) in variants(case, logs, lambda f, v, _: exact(nominal(f, v, {}), case)):
@@ -493,7 +493,7 @@ def test_a_rescaled_model_says_the_same_in_other_units(name: str) -> None:
             assert [len(r.t) for r in fitted] == [100] * 2 * (len(logs) - 1)
             continue
         assert len(test) == 1
-        bound = system.bind(fitted)
+        bound = BoundSystem(system, fitted)
         got = bound.run(bound.stage.neutral()[None])[0]
         scale = np.nanstd(bound.measured, axis=1) / np.nanstd(plain_bound.measured, axis=1)
         sign = np.sign(np.nansum(bound.measured * plain_bound.measured, axis=1))

@@ -45,6 +45,7 @@ from vaneloop.identification.unmodelled.fitted_candidate import (
 )
 from vaneloop.identification.unmodelled.parametric_preference import harmless
 from vaneloop.identification.unmodelled.screening import best_step, starts_of
+from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.by_log import bind
 from vaneloop.identification.user_models.exogenous_regressors import column_of
 from vaneloop.identification.user_models.hysteresis_regressors import (
@@ -83,7 +84,7 @@ def run_of_a_tank(n: int = 400) -> Record:
 
 @pytest.fixture(scope="module")
 def bound():
-    return TANK.bind([run_of_a_tank()])
+    return BoundSystem(TANK, [run_of_a_tank()])
 
 
 def bent(how: str, at: str, q: str):
@@ -506,7 +507,7 @@ def test_a_law_is_searched_for_without_another_that_it_holds(law: str) -> None:
         + 0.1 * np.random.default_rng(0).standard_normal(len(t))
     )
     record = Record("there and back", t, {"x": x, "force": force})
-    there = {e.name: e for e in axis.bind([record]).effects}
+    there = {e.name: e for e in BoundSystem(axis, [record]).effects}
     assert law not in there
     assert all(held in there for e in there.values() for held, _ in e.holds)
     assert law not in diagnose([record], axis).diagnosis.stages[0].final.effects
@@ -598,7 +599,7 @@ def test_a_hysteresis_is_learned_and_helps_another_log(tmp_path: Path) -> None:
     other = run_of_a_valve(2, "other")
 
     def left(m: Model) -> float:
-        bound = VALVE.bind([other], values=m.parameters, present=m.effects, curves=m.curves)
+        bound = BoundSystem(VALVE, [other], values=m.parameters, present=m.effects, curves=m.curves)
         return float(np.std(bound.measured[0] - bound.run(bound.stage.neutral()[None])[0, 0]))
 
     before, after = left(Model(parameters=model.parameters)), left(model)
@@ -625,7 +626,7 @@ def bent_valve() -> Record:
 @pytest.mark.parametrize("shape", [("odd",), ("zero",), ("rising", "zero"), ("rising",), ("falling",)])
 def test_a_curve_has_the_shape_that_is_known(shape: tuple[str, ...]) -> None:
     """Whatever its amplitudes, within their bounds; and a time that begins at 0 has no odd curve."""
-    bound = VALVE.bind([bent_valve()])
+    bound = BoundSystem(VALVE, [bent_valve()])
     shaped = [s for c in candidates(bound, bound.stage.neutral()[:1]) if (s := c.shaped(shape)) is not None]
     shaped = [c for c in shaped if not c.quantity.stops]
     assert any(c.quantity.name == "current" for c in shaped)
@@ -664,7 +665,7 @@ def test_a_test_log_speaks_of_a_curve_where_its_quantity_has_been() -> None:
     run = run_of_a_tank()
     further = replace(run, name="further", columns={**run.columns, "oil": run.columns["oil"] + 15.0})
     ground = OwnGround(bind(TANK, [run], [further]))
-    every = ground.candidates(TANK.bind([run]).stage.neutral()[:2])
+    every = ground.candidates(BoundSystem(TANK, [run]).stage.neutral()[:2])
     assert {c.quantity.name for c in every} >= {"oil", "pump", "level", "time", "direction_of_pump"}
     for c in every:
         if c.quantity.stops:
@@ -680,7 +681,7 @@ def test_a_test_log_speaks_of_a_curve_where_its_quantity_has_been() -> None:
 
 def test_a_formula_goes_on_while_it_is_not_much_steeper_than_where_logs_have_been() -> None:
     ground = OwnGround(bind(TANK, [run_of_a_tank()]))
-    c = next(c for c in ground.candidates(TANK.bind([run_of_a_tank()]).stage.neutral()[:2]) if c.name == NAME)
+    c = next(c for c in ground.candidates(BoundSystem(TANK, [run_of_a_tank()]).stage.neutral()[:2]) if c.name == NAME)
     low, high = c.basis.low, c.basis.high
     span = high - low
     form = {f.name: f for f in FORMS}
@@ -714,7 +715,7 @@ def test_a_reading_at_its_limit_does_not_hide_where_its_curve_bends() -> None:
     )  # fmt: skip
     t = np.arange(400.0) * 0.05
     current = 4.0 * np.sin(t)
-    bound = valve.bind([Record("run", t, {"current": current, "flow": np.minimum(2.0 * current, 3.0)})])
+    bound = BoundSystem(valve, [Record("run", t, {"current": current, "flow": np.minimum(2.0 * current, 3.0)})])
     every = {c.name: c.basis for c in candidates(bound, np.array([2.0]))}
     assert every["flow.curve_of_flow"].high == pytest.approx(8.0, abs=0.1)
     assert every["flow.curve_of_flow"].low == pytest.approx(-8.0, abs=0.1)
@@ -731,7 +732,7 @@ def test_a_jump_is_the_friction_of_the_library() -> None:
         masses={"speed": "mass"}, parameters=[unknown("mass", 4.0, "kg"), unknown("damping", 2.0, "N s/m")],
     )  # fmt: skip
     t = np.arange(400.0) * 0.05
-    bound = cart.bind([Record("run", t, {"push": 9.0 * np.sin(t), "speed": np.sin(t - 0.8)})])
+    bound = BoundSystem(cart, [Record("run", t, {"push": 9.0 * np.sin(t), "speed": np.sin(t - 0.8)})])
     named = with_curves(bound, ("speed.coulomb",), ())
     theta = np.append(named.stage.neutral()[:-1], 1.7)
     friction = named.run(theta[None])[0]
@@ -812,7 +813,7 @@ def test_a_force_of_position_or_speed_is_one_at_the_place_itself() -> None:
         "boom", "force", lambda u, p: p.mass * u.acceleration, position="angle", outputs={"torque": "Nm"},
         parameters=[unknown("mass", 2.0, "kg", low=0.0)],
     )  # fmt: skip
-    bound = boom.bind([Record("run", t, {"angle": np.sin(t), "torque": np.cos(3.0 * t)})])
+    bound = BoundSystem(boom, [Record("run", t, {"angle": np.sin(t), "torque": np.cos(3.0 * t)})])
     near = {c.quantity.name for c in candidates(bound, bound.stage.neutral()[:1]) if c.near}
     assert near == {"position", "velocity"}
 
@@ -884,7 +885,7 @@ def test_what_harms_a_test_log_makes_way_for_what_does_not_and_is_near_it() -> N
         return SimpleNamespace(candidate=SimpleNamespace(name=name), loose=list(formulas))
 
     bad, fine, said = named("bad"), named("fine"), named("said", named("formula"))
-    learner: Any = SimpleNamespace(_harmful=lambda _, t: "" if t.candidate.name in ("fine", "formula") else "worse")
+    learner: Any = SimpleNamespace(harmful=lambda _, t: "" if t.candidate.name in ("fine", "formula") else "worse")
     before: Any = None
     assert harmless(learner, before, [bad, fine, said], {"bad": 0.0, "fine": 0.4, "said": 0.3}) == [fine, said]
     assert harmless(learner, before, [bad, fine], {"bad": 0.0, "fine": 0.6}) == [bad, fine]

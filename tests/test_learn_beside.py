@@ -12,6 +12,7 @@ from vaneloop import Record, System, unknown
 from vaneloop.base.tables import read
 from vaneloop.identification.least_squares.problem import Judge
 from vaneloop.identification.selection.search import Search
+from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.by_log import bind
 from vaneloop.verbs.learn import learn
 
@@ -57,7 +58,7 @@ def test_a_curve_is_learned_behind_a_dead_time(tmp_path: Path) -> None:
     model = read(tmp_path / "law.toml", Model)
     assert model.effects["lever.dead_time"]["delay"] == pytest.approx(LATE, abs=0.02)
     other = run_of_a_valve(3)
-    bound = VALVE.bind([other], values=model.parameters, present=model.effects, curves=model.curves)
+    bound = BoundSystem(VALVE, [other], values=model.parameters, present=model.effects, curves=model.curves)
     assert np.std(bound.measured[0] - bound.run(bound.stage.neutral()[None])[0, 0]) < 0.04
 
 

@@ -102,7 +102,7 @@ def test_before_a_name_stands_the_formula_is_asked(
     monkeypatch.setattr(confirmed, "better_than", lambda *_: True)
     monkeypatch.setattr(confirmed, "fitted_formulas", lambda _, t: asked.append(t) or [(None, formula)])
     learner: Any = SimpleNamespace(
-        speaks=True, ground=SimpleNamespace(tests={"test"}), _change=lambda _, t: {"test": t.change, "fitted": 0.0}
+        speaks=True, ground=SimpleNamespace(tests={"test"}), change=lambda _, t: {"test": t.change, "fitted": 0.0}
     )
     assert confirmed.instead_of(learner, named, [curve]) is stands
     assert asked == [curve]
@@ -141,7 +141,7 @@ def test_a_curve_at_its_place_is_asked_by_its_formula_however_far_its_splines_go
         )  # fmt: skip
 
     learner: Any = SimpleNamespace(
-        _score=lambda t, among: t.score, _worth=lambda _, f: f.good, ground=SimpleNamespace(shares=False)
+        score=lambda t, among: t.score, worth=lambda _, f: f.good, ground=SimpleNamespace(shares=False)
     )
     before = tried(False, 0.0, 4.0, False)
     best, elsewhere = tried(False, 0.4, 1.0, False), tried(False, 2.0, 0.9, True)

@@ -69,7 +69,7 @@ def test_a_curve_of_many_splines_finds_its_lag_too(tau: float, begun: float) -> 
     current, c = late(learner)
     c = c.slower(begun * tau / tau_of(c))
     assert c is not None
-    coarse = learner._fitted(current, c, 1.0, np.append(learner.base.theta, np.zeros(len(c.parts))), 12)
+    coarse = learner.fitted(current, c, 1.0, np.append(learner.base.theta, np.zeros(len(c.parts))), 12)
     fine = learner._finer(current, coarse)
     assert fine is not None and len(fine.candidate.basis.bend) > len(c.basis.bend)
     best = learner._with_its_lag(current, fine, TIMES[1:])

@@ -28,6 +28,7 @@ from vaneloop.identification.unmodelled.learned_law import LearnedLaw
 from vaneloop.identification.unmodelled.learning import Learner
 from vaneloop.identification.unmodelled.python_law import python_law
 from vaneloop.identification.unmodelled.regressors import quantities
+from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.by_log import bind
 from vaneloop.identification.user_models.exogenous_regressors import sides_of
 from vaneloop.identification.user_models.law_file import from_file
@@ -77,7 +78,7 @@ def run_of_a_drive(seed: int, rate=drive, size: float = 6.0, n: int = 900, noise
 
 @pytest.fixture(scope="module")
 def bound():
-    return DRIVE.bind([run_of_a_drive(1, n=400)])
+    return BoundSystem(DRIVE, [run_of_a_drive(1, n=400)])
 
 
 # ---- what there is ---------------------------------------------------------------------------------------------------
@@ -100,15 +101,15 @@ def test_a_difference_is_of_one_unit_and_in_the_order_of_the_model(bound) -> Non
 @pytest.mark.parametrize("unit", ["", "-", "%"])
 def test_numbers_without_a_unit_need_not_be_of_one_kind(unit: str) -> None:
     plain_numbers = replace(DRIVE, states=dict.fromkeys(DRIVE.states, unit), inputs={"torque": unit, "belt": unit})
-    assert not differences(plain_numbers.bind([run_of_a_drive(1, n=200)]))
+    assert not differences(BoundSystem(plain_numbers, [run_of_a_drive(1, n=200)]))
 
 
 def test_a_difference_that_says_what_another_quantity_says_is_none() -> None:
     record = run_of_a_drive(1, n=300)
     constant = Record("run", record.t, {**record.columns, "belt": np.full(300, 2.0)})
-    assert list(differences(DRIVE.bind([constant]))) == [D]  # less a constant, a speed is the same quantity
+    assert list(differences(BoundSystem(DRIVE, [constant]))) == [D]  # less a constant, a speed is the same quantity
     logged = Record("run", record.t, {**record.columns, "slip": record.columns["motor"] - record.columns["drum"]})
-    assert D not in differences(DRIVE.bind([logged]))
+    assert D not in differences(BoundSystem(DRIVE, [logged]))
 
 
 @pytest.mark.slow
@@ -126,7 +127,7 @@ def test_what_the_model_has_as_a_difference_comes_first_of_many() -> None:
     rng = np.random.default_rng(0)
     t = np.arange(100.0)
     bodies = {n: 300.0 + np.cumsum(rng.standard_normal(100)) for n in names}
-    found = list(differences(ring.bind([Record("run", t, bodies)])))
+    found = list(differences(BoundSystem(ring, [Record("run", t, bodies)])))
     assert len(found) == 20
     assert set(found[:10]) == {*(f"t{k}_minus_t{k + 1}" for k in range(9)), "t0_minus_t9"}
 
@@ -211,7 +212,7 @@ def test_a_model_that_is_not_simulated_takes_the_difference_of_its_inputs() -> N
     rng = np.random.default_rng(0)
     supply, tank = rng.uniform(50.0, 90.0, 300), rng.uniform(0.0, 40.0, 300)
     pressures = {"supply": supply, "tank": tank, "flow": 2.0 * (supply - tank)}
-    bound = valve.bind([Record("run", np.arange(300.0), pressures)])
+    bound = BoundSystem(valve, [Record("run", np.arange(300.0), pressures)])
     law = Learned(how="parameter times", at="gain", of="supply_minus_tank", low=0.0, high=90.0, form="line",
                   values=[-0.005])  # fmt: skip
     y = with_curves(bound, (), [from_file("gain.gain_of_supply_minus_tank", law, bound.data)])
@@ -240,7 +241,7 @@ def test_a_law_file_of_a_difference_does_what_the_curve_does(bound, tmp_path: Pa
 def test_a_channel_of_that_name_stands_before_the_difference() -> None:
     record = run_of_a_drive(1, n=300)
     named = Record("run", record.t, {**record.columns, D: np.sin(record.t)})
-    bound = DRIVE.bind([named])
+    bound = BoundSystem(DRIVE, [named])
     (placed, _), d = from_file("law", LAW, bound.data), differences(bound)
     assert D not in d and placed.curve is not None
     assert placed.curve.less is None
@@ -278,8 +279,8 @@ def test_the_python_file_gives_the_same_simulation(bound, tmp_path: Path) -> Non
         return (u.torque - torque) / 0.5, (torque - p.drag * x.drum) / 2.0
 
     short = [run_of_a_drive(1, n=60)]
-    by_hand = with_curves(replace(DRIVE, model=with_law).bind(short), (), [])
-    plain_drive = with_curves(DRIVE.bind(short), (), [])
+    by_hand = with_curves(BoundSystem(replace(DRIVE, model=with_law), short), (), [])
+    plain_drive = with_curves(BoundSystem(DRIVE, short), (), [])
     file = with_curves(plain_drive, (), [from_file("law", LAW, plain_drive.data)])
     by_hand.runner.steps = file.runner.steps
     theirs, ours = by_hand.run(np.array([[2.0, 0.8]])), file.run(np.array([[2.0, 0.8, 0.1]]))
@@ -356,7 +357,7 @@ def test_where_a_formula_of_a_plainer_curve_goes_before_the_best_curve_all_have_
         return Values(candidate=candidate, fit=Values(cost=np.ones(1), free=[0]), judge=Values(n=1), loose=[said])
 
     learner: Any = Values(
-        fails=lambda _: False, _harmful=lambda *_: "", ground=Values(shares=False), _left=lambda _, f, __: f.left
+        fails=lambda _: False, harmful=lambda *_: "", ground=Values(shares=False), left=lambda _, f, __: f.left
     )
     for plainer, expected in ((-0.5, {"a": -0.5, "a_minus_b": -2.0}), (0.2, {"a": 0.2, "a_minus_b": 0.0})):
         left = {"a": 0.3, "a_minus_b": 0.0}

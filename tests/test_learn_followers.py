@@ -47,14 +47,14 @@ def with_load(force: float) -> tuple[Learner, Tried, list[Tried]]:
     before = Tried(learner.candidates[0], 0.0, learner.judge, learner.base, ())
     begin = [np.append(learner.base.theta, np.zeros(len(c.parts))) for c in learner.candidates]
     both = zip(learner.candidates, begin, strict=True)
-    return learner, before, [learner._fitted(before, c, SCREENED, theta, 12) for c, theta in both]
+    return learner, before, [learner.fitted(before, c, SCREENED, theta, 12) for c, theta in both]
 
 
 @pytest.mark.slow
 def test_what_a_formula_says_is_learned_and_not_the_channel_that_follows_it() -> None:
     """The stroke goes with the speed by its schedule. As a curve of it the load does as well, and as no formula."""
     learner, before, tried = with_load(-1500.0)
-    left = {t.candidate.name: learner._left(before, t, tried) for t in tried}
+    left = {t.candidate.name: learner.left(before, t, tried) for t in tried}
     near = learner._near(before, list(tried), left)
     assert [t.candidate.name for t in near] == [STROKE, SPEED]  # the stroke is at its place itself
     (first, second) = said_first(learner, near, left)
@@ -75,7 +75,7 @@ def test_a_slope_that_a_known_noise_tells_is_kept() -> None:
 def test_what_formulas_of_two_channels_say_as_well_is_of_the_plainer(monkeypatch: pytest.MonkeyPatch) -> None:
     learner, _, tried = with_load(-1500.0)
     stroke, speed = (next(t for t in tried if t.candidate.name == name) for name in (STROKE, SPEED))
-    best = min(tried, key=lambda t: float(learner._judged(t, tried)[1].held_out.sum()))
+    best = min(tried, key=lambda t: float(learner.judged(t, tried)[1].held_out.sum()))
     monkeypatch.setattr(by_formula, "with_and_without_mean", lambda *_: [best])  # whatever curve it stands for
     for near in ([stroke, speed], [speed, stroke]):
         assert said_first(learner, near, {STROKE: 0.0, SPEED: 0.0}) == near

@@ -31,6 +31,7 @@ from vaneloop.identification.candidates.spline_basis import FINE_HARMONICS, wave
 from vaneloop.identification.unmodelled.fitted_candidate import Tried
 from vaneloop.identification.unmodelled.learning import Learner
 from vaneloop.identification.unmodelled.spectral_lines import Course, Lines
+from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.exogenous_regressors import every
 from vaneloop.identification.user_models.law_file import from_file
 from vaneloop.verbs.learn import learn, learned
@@ -204,7 +205,7 @@ HELD = replace(TANK, between="hold")
 
 def left_by(system: System, model: Model, log: Record, values: Mapping[str, float]) -> float:
     """RMS of what a model with these ``values`` of its parameters leaves of the first output."""
-    bound = system.bind([log], values=values, present=model.effects, curves=model.curves)
+    bound = BoundSystem(system, [log], values=values, present=model.effects, curves=model.curves)
     return float(np.std(bound.measured[0] - bound.run(bound.stage.neutral()[None])[0, 0]))
 
 
@@ -234,7 +235,7 @@ def test_its_file_says_the_same_to_another_log(humming, tmp_path) -> None:
     model = read(tmp_path / "law.toml", Model)
     (name,) = model.curves
     other = hummed(3, "three", 1.0)
-    data = HELD.bind([other]).data
+    data = BoundSystem(HELD, [other]).data
     placed, _ = from_file(name, model.curves[name], data)
     assert np.allclose(data.column(0, placed.curve.quantity), other.t % period_of(placed.curve.quantity))
 
@@ -291,12 +292,12 @@ def test_a_hum_beside_a_gain_that_drifts_is_the_second_law(drifting) -> None:
 def test_a_second_law_that_harms_a_log_is_told_and_the_first_one_stands(drifting, monkeypatch) -> None:
     """The same logs, with the candidates that were found for them."""
     _, diagnosis, found = drifting
-    harmful = Learner._harmful
+    harmful = Learner.harmful
 
     def second_harms(self, current, best) -> str:
         return "makes two worse" if current.curves else harmful(self, current, best)
 
-    monkeypatch.setattr(Learner, "_harmful", second_harms)
+    monkeypatch.setattr(Learner, "harmful", second_harms)
     monkeypatch.setattr(Learner, "_finalists", lambda self, current: found[step_of(self, current)])
     monkeypatch.setattr("vaneloop.verbs.learn.diagnose", lambda *_, **__: diagnosis)
     answer = learned_where_the_gain_drifts()

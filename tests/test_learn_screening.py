@@ -130,6 +130,6 @@ def test_a_measured_angle_puts_no_other_quantity_behind() -> None:
         good = [judged(first, -1e-3), judged(plain, 0.0)]
         left = {good[0].candidate.name: -1.0, good[1].candidate.name: -0.99}
         learner.fails = lambda tried: False  # type: ignore[method-assign]
-        learner._judged = lambda tried, among: (learner.judge, tried.fit)  # type: ignore[method-assign, assignment]
+        learner.judged = lambda tried, among: (learner.judge, tried.fit)  # type: ignore[method-assign, assignment]
         learner._tell_apart(good, left)
         assert (left[plain.name] > -0.95) == behind

@@ -18,6 +18,7 @@ from vaneloop.identification.least_squares.problem import Judge
 from vaneloop.identification.subsystem import Array, Effect, Parameter, Stage
 from vaneloop.identification.unmodelled.curve_candidates import candidates, with_curves
 from vaneloop.identification.user_models import simulation as runner
+from vaneloop.identification.user_models.bound_system import BoundSystem
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 
@@ -149,7 +150,7 @@ def test_an_interval_that_no_jump_is_met_in_needs_no_more_steps(monkeypatch: pyt
         name="lags", kind="simulate", model=relay, inputs={"v": "V"}, states={"first": "V", "second": "V"},
         outputs={"second": "V"}, parameters=[unknown("rate", 2.0, "1/s")],
     )  # fmt: skip
-    bound = system.bind([record])
+    bound = BoundSystem(system, [record])
     own = bound.stage.neutral()[: len(bound.stage.parameters)]
     known = candidates(with_curves(bound, (), ()), own)
     c = next(c for c in known if c.name == "second.curve_of_first").jumping()

@@ -15,6 +15,7 @@ from vaneloop.identification import Record, System, unknown
 from vaneloop.identification.unmodelled.screening import smoothed
 from vaneloop.identification.user_models import injection_points as nominal
 from vaneloop.identification.user_models import simulation as runner
+from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.codegen import compiled_code
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -35,7 +36,7 @@ def test_sets_in_two_threads_are_those_run_one_by_one(monkeypatch: pytest.Monkey
         name="tank", kind="simulate", model=tank, inputs={"pump": "V"}, states={"level": "cm"},
         outputs={"level": "cm"}, parameters=[unknown("inflow", 0.1, "cm/(V s)"), unknown("outflow", 0.05, "1/s")],
     )  # fmt: skip
-    stage = system.bind([record]).stage
+    stage = BoundSystem(system, [record]).stage
     sets = np.repeat(stage.neutral()[None], 8, axis=0)
     sets[:, 0] *= np.linspace(0.5, 1.5, 8)
     for k, effect in enumerate(stage.effects[:6]):
@@ -124,7 +125,7 @@ def test_models_that_return_a_list_run_as_those_that_return_a_tuple() -> None:
             name="lags", kind="simulate", model=model, inputs={"v": "V"}, states={"first": "V", "second": "V"},
             outputs={"level": "V", "rate": "V/s"}, output=output, parameters=[unknown("rate", 2.0, "1/s")],
         )  # fmt: skip
-        bound = system.bind([record])
+        bound = BoundSystem(system, [record])
         assert not any("plain Python" in note for note in bound.data.notes)
         stage = bound.stage
         sets = np.repeat(stage.neutral()[None], 4, axis=0)
@@ -153,7 +154,7 @@ def test_smoothness_goes_the_way_that_helps_from_fit_to_fit(
         seen.append((wiggle, begin))
         return SimpleNamespace(wiggle=wiggle, fit=wiggle)
 
-    learner: Any = SimpleNamespace(_fitted=fitted, _score=lambda tried: scores[tried.wiggle])
+    learner: Any = SimpleNamespace(fitted=fitted, score=lambda tried: scores[tried.wiggle])
     got: Any = smoothed(learner, learner, learner, np.zeros(1), tuple(scores))
     assert got.wiggle == best
     assert [wiggle for wiggle, _ in seen] == asked
@@ -195,7 +196,7 @@ def test_a_set_of_the_model_s_own_parameters_has_no_law() -> None:
         name="tank", kind="simulate", model=tank, inputs={"pump": "V"}, states={"level": "cm"},
         outputs={"level": "cm"}, parameters=[unknown("inflow", 0.1, "cm/(V s)"), unknown("outflow", 0.05, "1/s")],
     )  # fmt: skip
-    bound = system.bind([record])
+    bound = BoundSystem(system, [record])
     whole, own = bound.stage.neutral(), len(bound.stage.parameters)
     assert {"pump.gain", "level_sensor.gain"} <= {q.effect for q in bound.placed}
     assert np.array_equal(bound.run(whole[None, :own]), bound.run(whole[None]))
@@ -218,7 +219,7 @@ def test_states_that_nobody_measures_are_walked_through_once(monkeypatch: pytest
         parameters=[unknown("unused", 1.0, "-")],
     )  # fmt: skip
     record = Record("log", t, {"v": np.ones(1000), "sum": 2.0 - (2.0 + t) * np.exp(-t)})
-    bound = system.bind([record])
+    bound = BoundSystem(system, [record])
     walked.clear()
     states = nominal.nominal_course(bound.runner, np.array([1.0])).states
     np.testing.assert_allclose(states[0][0], 1.0 - np.exp(-t), atol=1e-5)

@@ -31,6 +31,7 @@ from vaneloop.base.tables import read
 from vaneloop.cli.hidden_law import surface_summary
 from vaneloop.identification import StageError
 from vaneloop.identification.unmodelled.curve_candidates import with_curves
+from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.law_file import from_file
 from vaneloop.verbs.learn import learn
 
@@ -44,7 +45,7 @@ KNOTS = {
 
 @pytest.fixture(scope="module")
 def bound():
-    return TANK.bind([run_of_a_tank()])
+    return BoundSystem(TANK, [run_of_a_tank()])
 
 
 def law(
@@ -123,7 +124,7 @@ def test_a_surface_is_the_same_in_the_loop_and_beside_it(x: float, z: float, see
 
 
 def read_surface(one: Learned, low: np.ndarray, high: np.ndarray) -> Any:
-    placed, _ = from_file("a.b", one, TANK.bind([run_of_a_tank(60)]).data)
+    placed, _ = from_file("a.b", one, BoundSystem(TANK, [run_of_a_tank(60)]).data)
     ends = {"low": low[0], "high": high[0], "low_second": low[1], "high_second": high[1]}
     return dataclasses.replace(placed.curve, **ends)
 

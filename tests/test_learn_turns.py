@@ -19,6 +19,7 @@ from vaneloop.identification import StageError
 from vaneloop.identification.unmodelled.python_law import python_law
 from vaneloop.identification.unmodelled.regressors import quantities
 from vaneloop.identification.unmodelled.spectral_lines import periods_along
+from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.exogenous_regressors import every
 from vaneloop.identification.user_models.law_file import from_file
 from vaneloop.pages.learned import about, curve_figure
@@ -162,7 +163,7 @@ def test_its_file_says_the_same_to_another_log_and_in_python(eccentric, tmp_path
 
     before, after = (left_by(MOTOR, m, other, own) for m in (Model(), model))
     assert before > 0.01 and after < 0.5 * before
-    data = MOTOR.bind([other]).data
+    data = BoundSystem(MOTOR, [other]).data
     wrong = model.curves[name].model_copy(update={"of": "shaft_every_6p283"})
     with pytest.raises(StageError, match="shaft"):
         from_file(name, wrong, data)
@@ -190,7 +191,7 @@ def test_a_channel_that_is_only_named_so_is_no_period() -> None:
     """A user's own channel, such as a counter that is read on every fifth cycle."""
     one = turned(1, "one", 0.02)
     told = Record(one.name, one.t, {**one.columns, "count_every_5": np.linspace(0.0, 100.0, len(one.t))})
-    bound = MOTOR.bind([told])
+    bound = BoundSystem(MOTOR, [told])
     (q,) = [q for q in quantities(bound, bound.stage.neutral()) if q.name == "count_every_5"]
     assert q.period == 0.0
     assert bound.data.column(0, "count_every_5")[-1] == 100.0

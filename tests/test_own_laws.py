@@ -18,6 +18,7 @@ from vaneloop import Law, Parameter, Record, System, unknown
 from vaneloop.base.errors import InputError
 from vaneloop.cli.main import main
 from vaneloop.identification.subsystem import StageError
+from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.codegen import dispatch_of
 from vaneloop.verbs.search import compare, diagnose, extend
 
@@ -109,8 +110,10 @@ def test_a_simulation_with_a_law_of_ones_own_is_that_of_the_model_that_has_it() 
         "start": {"x": 0.5}, "between": "line",
     }  # fmt: skip
     record = Record("run", t, {"force": u, "x": u})
-    have = System("a", "simulate", model, laws=[MAGNET], **given).bind([record], present={"v.magnet": {"force": 1.5}})
-    want = System("a", "simulate", whole, **given).bind([record])
+    have = BoundSystem(
+        System("a", "simulate", model, laws=[MAGNET], **given), [record], present={"v.magnet": {"force": 1.5}}
+    )
+    want = BoundSystem(System("a", "simulate", whole, **given), [record])
     have.runner.steps = want.runner.steps = 8
     np.testing.assert_allclose(
         have.run(have.stage.neutral()[None]), want.run(want.stage.neutral()[None]), rtol=1e-9, atol=1e-12
@@ -198,7 +201,7 @@ def test_an_own_law_of_a_state_is_found_in_a_simulation() -> None:
 )
 def test_a_law_acts_where_it_may(places: list[str] | None, where: set[str]) -> None:
     law = Law("worn", "signal", worn, WEAR.parameters, WEAR.starts, places=places)
-    bound = map_with(law).bind([Record("a", T, {"u": wave(1), "y": wave(1)})])
+    bound = BoundSystem(map_with(law), [Record("a", T, {"u": wave(1), "y": wave(1)})])
     assert {e.name for e in bound.effects if e.name.endswith("worn")} == where
 
 
@@ -398,7 +401,7 @@ def test_an_own_law_with_the_equation_of_the_library_s_gives_the_same(
     columns = {next(iter(drive)): wave(3, t), "x": 0.3 * wave(4, t), "w": 0.2 * wave(5, t)}
     effects = [f"{place}.{name}" for name in (law, own.name)]
     p = own.parameters[0]
-    bound = system.bind([Record("run", t, columns)], present={e: {p.name: size} for e in effects})
+    bound = BoundSystem(system, [Record("run", t, columns)], present={e: {p.name: size} for e in effects})
     bound.runner.steps = 8
     names = [q.name for q in bound.stage.parameters]
     column = [names.index(f"{e}.{p.name}") for e in effects]

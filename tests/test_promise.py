@@ -12,7 +12,7 @@ from vaneloop.identification.selection.relative_error_acceptance import ErrorSha
 from vaneloop.identification.selection.screening import Slopes, _solved, along, followed, out_of, within
 from vaneloop.identification.selection.search import Search
 from vaneloop.identification.subsystem import Effect, Parameter, Stage
-from vaneloop.identification.user_models.bound_system import steps_seen
+from vaneloop.identification.user_models.bound_system import BoundSystem, steps_seen
 from vaneloop.identification.user_models.motion import low_pass
 
 N = 600
@@ -125,13 +125,13 @@ def test_a_system_that_forgets_slowly_has_its_starts_fitted():
         angle, rate = (v + noise * rng.standard_normal(len(t)) for v in (angle, rate))
         return Record("swing", t, {"angle": angle, "rate": rate})
 
-    slow = system(0.02).bind([log(0.02, 1500)])
+    slow = BoundSystem(system(0.02), [log(0.02, 1500)])
     assert slow.read_starts and [p.name for p in slow.stage.parameters[2:]] == ["start_rate", "start_angle"]
     assert slow.floor == pytest.approx(slow.data.noise())
     fit = Judge(slow.stage, slow.floor).fit((), slow.stage.neutral())
     assert float(np.sqrt(fit.cost.sum() / (2 * len(slow.t)))) == pytest.approx(1.0, abs=0.06)
     assert fit.theta[3] == pytest.approx(1.0, abs=0.01)  # the reading is off by some 0.03
-    assert not system(3.0).bind([log(3.0, 12000)]).read_starts
+    assert not BoundSystem(system(3.0), [log(3.0, 12000)]).read_starts
 
 
 def test_a_law_that_holds_another_is_no_worse_than_it_though_it_was_fitted_first():
@@ -145,7 +145,7 @@ def test_a_law_that_holds_another_is_no_worse_than_it_though_it_was_fitted_first
         parameters=[unknown("gain", 1.0, "-")], places=["command"],
     )  # fmt: skip
     flow = 3.0 * np.array(moved) + 0.1 * rng.standard_normal(N)
-    bound = system.bind([Record("valve", T, {"command": command, "flow": flow})])
+    bound = BoundSystem(system, [Record("valve", T, {"command": command, "flow": flow})])
     judge = Judge(bound.thinned, bound.floor)
     search = Search(ErrorShare(judge))
     first = judge.stage.neutral()
@@ -171,7 +171,7 @@ def test_stiction_is_found_on_from_the_play_that_stands_in_for_it(width: float, 
         "valve", "simulate", lambda x, u, p: p.rate * (u.command - x.flow), inputs={"command": "%"},
         states={"flow": "%"}, outputs={"flow": "%"}, parameters=[unknown("rate", 1.0, "1/s")], places=["command"],
     )  # fmt: skip
-    bound = system.bind([Record("valve", t, {"command": command, "flow": flow})])
+    bound = BoundSystem(system, [Record("valve", t, {"command": command, "flow": flow})])
     judge = Judge(bound.thinned, bound.floor)
     search = Search(ErrorShare(judge))
     play, stiction = search.single("command.play"), search.single("command.stiction")
@@ -189,7 +189,7 @@ def test_quick_steps_lead_where_the_fit_goes_with_fewer_simulations(iterations: 
         outputs={"y": "V"}, parameters=[unknown("gain", 1.0, "-"), unknown("bend", 0.1, "-", low=0.0)], places=["u"],
     )  # fmt: skip
     y = 2.0 * u + 0.7 * u**3 / (1.0 + 0.7 * u**2) + 0.5 + 0.05 * rng.standard_normal(N)
-    bound = system.bind([Record("bent", T, {"u": u, "y": y})])
+    bound = BoundSystem(system, [Record("bent", T, {"u": u, "y": y})])
     asked: list[int] = []
 
     class Counting(Judge):

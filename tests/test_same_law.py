@@ -10,6 +10,7 @@ import pytest
 from vaneloop import Record, System, unknown
 from vaneloop.cli.same_law import same_by_equations
 from vaneloop.identification.candidates.closed_forms import Formula
+from vaneloop.identification.user_models.bound_system import BoundSystem
 
 VALVE = System(
     "valve", "static", lambda u, p: p.gain * u.current + p.offset, inputs={"current": "mA"}, outputs={"flow": "l/min"},
@@ -31,7 +32,7 @@ def law(how: str, at: str, of: str, x: np.ndarray, y: np.ndarray, band: float, f
 
 def test_a_flow_that_is_rectified_is_a_curve_of_the_current_that_makes_it() -> None:
     current = 4.0 * np.sin(T)
-    bound = VALVE.bind([Record("run", T, {"current": current, "flow": np.abs(2.0 * current + 3.0)})])
+    bound = BoundSystem(VALVE, [Record("run", T, {"current": current, "flow": np.abs(2.0 * current + 3.0)})])
     x = np.linspace(-4.0, 4.0, 257)
     formula = Formula("below", "", {"a": -2.0, "b": -1.5}, 1.0, 4)
 
@@ -60,7 +61,7 @@ def test_a_flow_that_is_rectified_is_a_curve_of_the_current_that_makes_it() -> N
 )
 def test_a_drag_is_a_gain_of_the_damping_and_no_gain_of_the_mass(how: str, at: str, of: str, same: bool) -> None:
     """Along a log a function of time could be the same; by the equations it is not."""
-    bound = CART.bind([Record("run", T, {"push": 5.0 * np.sin(T), "speed": np.sin(T - 0.8)})])
+    bound = BoundSystem(CART, [Record("run", T, {"push": 5.0 * np.sin(T), "speed": np.sin(T - 0.8)})])
     x = np.linspace(-1.0, 1.0, 257) if of == "speed" else np.linspace(0.0, 20.0, 257)
     q = x if of == "speed" else np.sin(x - 0.8)
     y = {"damping": 0.35 * np.abs(q), "push": -0.7 * q * np.abs(q), "mass": 0.35 * np.abs(q)}[at]
@@ -83,7 +84,7 @@ def test_a_bias_of_the_pump_is_a_constant_flow_into_its_tank_whatever_cannot_be_
         parameters=[unknown("inflow", 0.15, "cm/(V s)"), unknown("outflow", 0.35, "1/s")],
     )  # fmt: skip
     pump = 3.0 + 2.0 * np.sin(T)
-    bound = tanks.bind([Record("run", T, {"pump": pump, "lower": 2.0 * pump})])
+    bound = BoundSystem(tanks, [Record("run", T, {"pump": pump, "lower": 2.0 * pump})])
     x = np.linspace(1.0, 5.0, 257)
     # what adds to a state is taken off it; no parameter makes a constant flow
     learned = law("state adds", "upper", "pump", x, np.full(257, -flow + 1e-5), 1e-3, untold=untold)

@@ -20,6 +20,7 @@ from vaneloop.cli.main import main
 from vaneloop.identification import Parameter, Record, StageError, System, load_system, unknown
 from vaneloop.identification.least_squares.problem import Judge
 from vaneloop.identification.unmodelled.curve_candidates import candidates
+from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.data import Data
 from vaneloop.verbs.search import Diagnosed, diagnose, extend, locate
 
@@ -200,7 +201,7 @@ def bent(seed: int, noise_of_position: float) -> tuple[System, Record]:
 @pytest.mark.parametrize("seed", range(4))
 def test_a_force_that_bends_is_that_of_the_whole_motion(seed: int) -> None:
     system, log = bent(seed, 1e-5)
-    bound = system.bind([log])
+    bound = BoundSystem(system, [log])
     left = (bound.measured - bound.run(bound.stage.neutral()[None])[0])[0]
     assert np.sqrt(np.nanmean(left**2)) < 0.002 * np.std(log.columns["force"])  # what noise of the samples is there
 
@@ -318,7 +319,7 @@ def test_a_smooth_input_between_few_samples_is_followed() -> None:
             "lag", "simulate", lambda x, u, p: (u.u - x.y) / p.late, outputs={"y": "V"}, inputs={"u": "V"},
             states={"y": "V"}, parameters=[Parameter("late", late, "s")], between=between,
         )  # fmt: skip
-        bound = system.bind([Record("sine", t, {"u": np.sin(omega * t), "y": true})])
+        bound = BoundSystem(system, [Record("sine", t, {"u": np.sin(omega * t), "y": true})])
         left[between] = float(np.sqrt(np.mean((bound.run(bound.stage.neutral()[None])[0, 0] - true)[20:-20] ** 2)))
     assert left["smooth"] < 0.1 * left["line"] < 0.1 * left["hold"]
     assert left["smooth"] < 0.01 * float(np.std(true))
@@ -443,7 +444,7 @@ def test_a_parameter_may_be_tiny_or_huge_in_its_unit(volt: float, cm: float) -> 
 @pytest.mark.parametrize("cm", [1e-12, 1.0, 1e9])
 def test_an_unknown_that_begins_at_0_has_the_size_that_moves_an_output(cm: float) -> None:
     system = tank_of(1.0, cm, unknown("spring", 0.0, "cm/s"))
-    bound = system.bind([drained(3, 1.0, cm, spring=0.0)])
+    bound = BoundSystem(system, [drained(3, 1.0, cm, spring=0.0)])
     spring = next(p for p in bound.stage.parameters if p.name == "spring")
     spread = float(np.std(bound.measured))
     away = bound.stage.neutral()
@@ -461,7 +462,7 @@ def test_a_law_of_a_model_file_that_is_0_can_be_fitted() -> None:
                     Parameter("out", 0.3, "cm^0.5/s")],
     )  # fmt: skip
     nothing = {"upper.overflow_to_lower": {"level": 10.0, "share": 0.0}}
-    bound = system.bind([tanks(1, True)], present=nothing)
+    bound = BoundSystem(system, [tanks(1, True)], present=nothing)
     share = next(p for p in bound.stage.parameters if p.name.endswith(".share"))
     assert share.tolerance > 0.1
     judge = Judge(bound.stage, bound.floor)
@@ -480,7 +481,7 @@ def test_a_channel_that_stands_still_has_curves_of_a_finite_size(value: float) -
         parameters=[unknown("inflow", 0.2, "cm/(V s)"), unknown("outflow", 0.05, "1/s")],
     )  # fmt: skip
     record = Record("run", t, {"pump": wave(3)[:400], "oil": np.full(400, value), "level": wave(5)[:400]})
-    bound = system.bind([record])
+    bound = BoundSystem(system, [record])
     found = candidates(bound, bound.stage.neutral()[: len(bound.stage.parameters)])
     assert {c.at for c in found} >= {"oil", "lid", "level"}
     for c in found:

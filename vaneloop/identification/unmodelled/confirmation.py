@@ -8,7 +8,6 @@ already, another law that is not the truth either does not stand before them for
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,10 +17,8 @@ from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
 from vaneloop.identification.unmodelled.fitted_candidate import Tried, step_without
 from vaneloop.identification.unmodelled.parametric_preference import better_than
+from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.user_models.hysteresis_regressors import swings
-
-if TYPE_CHECKING:
-    from vaneloop.identification.unmodelled.learning import Learner
 
 __all__ = ["another_confirms", "instead_of", "moves", "stands_before"]
 
@@ -40,7 +37,7 @@ def moves(tried: Tried) -> tuple[Array, Array]:
     return np.maximum.reduceat(wide[some][:n], start), log[some][:n][start]
 
 
-def another_confirms(learner: Learner, before: Tried, tried: Tried) -> bool:
+def another_confirms(learner: CurveProblem, before: Tried, tried: Tried) -> bool:
     """Whether another log, or another amplitude, says the same of a curve that remembers.
 
     Manoeuvres of one size do not hold out a hysteresis: what imitates one of them imitates all. So each log is left out
@@ -50,7 +47,7 @@ def another_confirms(learner: Learner, before: Tried, tried: Tried) -> bool:
     """
     if not tried.candidate.quantity.remembers:
         return True
-    change, tests = learner._change(before, tried), learner.ground.tests
+    change, tests = learner.change(before, tried), learner.ground.tests
     if change and tests & set(change):
         return min(change[log] for log in tests & set(change)) < -LEAST_USE
     far, log = moves(tried)
@@ -70,7 +67,7 @@ def another_confirms(learner: Learner, before: Tried, tried: Tried) -> bool:
     return True
 
 
-def instead_of(learner: Learner, named: Tried, curves: Sequence[Tried]) -> bool:
+def instead_of(learner: CurveProblem, named: Tried, curves: Sequence[Tried]) -> bool:
     """Whether curves, of which the last stands beside the others, are taken instead of the laws with names: they must
     earn that as a second law must before the first, and be the law, or be confirmed (`stands_before`). So may a formula
     in place of either: a test log that goes further tells what splines say at their ends, and what they do not follow
@@ -88,12 +85,12 @@ def instead_of(learner: Learner, named: Tried, curves: Sequence[Tried]) -> bool:
     return len(curves) > 1 and any(_stands(learner, named, t) for _, t in curves[0].formulas or ())
 
 
-def _stands(learner: Learner, named: Tried, tried: Tried) -> bool:
+def _stands(learner: CurveProblem, named: Tried, tried: Tried) -> bool:
     if not better_than(learner, named, tried):
         return False
     was = rms_of(named.judge, named.fit)
     for t in (tried, *(f for _, f in tried.formulas or ())):
-        tests = {log: c for log, c in learner._change(named, t).items() if log in learner.ground.tests}
+        tests = {log: c for log, c in learner.change(named, t).items() if log in learner.ground.tests}
         if stands_before(was, rms_of(t.judge, t.fit), tests):
             return True
     return False

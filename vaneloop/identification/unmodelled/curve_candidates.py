@@ -17,7 +17,7 @@ from vaneloop.identification.candidates.spline_basis import COUNT, FINE_HARMONIC
 from vaneloop.identification.subsystem import Array, Effect, Stage, size_of
 from vaneloop.identification.unmodelled.regressors import Quantity, difference, quantities
 from vaneloop.identification.unmodelled.spectral_lines import Course
-from vaneloop.identification.user_models.bound_system import MOST_SAMPLES, Bound
+from vaneloop.identification.user_models.bound_system import MOST_SAMPLES, BoundSystem
 from vaneloop.identification.user_models.by_log import Logs
 from vaneloop.identification.user_models.exogenous_regressors import TIME, every
 from vaneloop.identification.user_models.hysteresis_regressors import STOPS
@@ -251,7 +251,7 @@ def _slips(how: str, at: str, q: Quantity, s: System) -> bool:
     return how == "output adds" if s.kind == "static" else how == "input adds" and q.name == STOPS + at
 
 
-def candidates(bound: Bound, values: Array) -> list[Candidate]:
+def candidates(bound: BoundSystem, values: Array) -> list[Candidate]:
     """Every curve that may be missing: each place with each quantity."""
     s = bound.system
     moves = s.kind in ("simulate", "closed_loop")
@@ -320,7 +320,7 @@ def candidates(bound: Bound, values: Array) -> list[Candidate]:
     return out
 
 
-def _said(bound: Bound, values: Array) -> Array:
+def _said(bound: BoundSystem, values: Array) -> Array:
     """What the model says to the logs without any curve."""
     plain = with_curves(bound, (), ())
     theta = plain.stage.neutral()
@@ -340,7 +340,7 @@ def _further(measured: Array, said: Array) -> Array:
     return np.where(near & ~(np.abs(measured - middle) >= np.abs(said - middle)), said, measured)
 
 
-def with_curves(bound: Bound, laws: Sequence[str], curves: Sequence[tuple[Placed, Effect]]) -> Bound:
+def with_curves(bound: BoundSystem, laws: Sequence[str], curves: Sequence[tuple[Placed, Effect]]) -> BoundSystem:
     """The model on the same logs with only these laws of the library, and these curves, as effects."""
     out = copy.copy(bound)
     runner = out.runner = copy.copy(bound.runner)

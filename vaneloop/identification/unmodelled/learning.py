@@ -9,28 +9,22 @@ test log. Beside laws with names it must do clearly better than the best of them
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from vaneloop.base.side_by_side import Answer, Item, side_by_side
-from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known
 from vaneloop.identification.least_squares.problem import Fit, Judge
 from vaneloop.identification.regimes import agrees
-from vaneloop.identification.results import StageDiagnosis, rms_of
-from vaneloop.identification.selection.likelihood_acceptance import correlation_of
+from vaneloop.identification.results import rms_of
 from vaneloop.identification.selection.relative_error_acceptance import (
     BETTER,
     HARM,
-    LEAST_USE,
     MOST_LEFT,
     PER_PARAMETER,
     RIVAL,
     UNKNOWN,
-    ErrorShare,
     score,
-    worth,
 )
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
@@ -38,30 +32,18 @@ from vaneloop.identification.unmodelled.confirmation import another_confirms, in
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
 from vaneloop.identification.unmodelled.fitted_candidate import (
     MEASURED,
-    Ground,
     Outcome,
-    Placings,
     Tried,
     adds_what,
-    at_samples,
     channel_of,
     one_constant,
     plain,
     stands,
     strange,
     surely_more,
-    told_by_others,
-    with_held_out,
     without_its_lag,
 )
-from vaneloop.identification.unmodelled.likelihood_acceptance import (
-    earns,
-    grain_of,
-    in_grains,
-    promises,
-    told_in_nats,
-    unconfirmed,
-)
+from vaneloop.identification.unmodelled.likelihood_acceptance import grain_of, in_grains, promises
 from vaneloop.identification.unmodelled.parametric_preference import (
     all_in_their_place,
     at_its_place,
@@ -72,9 +54,9 @@ from vaneloop.identification.unmodelled.parametric_preference import (
     without_memory,
 )
 from vaneloop.identification.unmodelled.parametric_substitution import tell_each_by_its_formula
+from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.unmodelled.screening import SCREENED, screened, smoothed
 from vaneloop.identification.unmodelled.surface_search import put_surface
-from vaneloop.identification.user_models.bound_system import rms_of_rows
 from vaneloop.identification.user_models.exogenous_regressors import TIME
 from vaneloop.identification.user_models.hysteresis_regressors import dissipates
 
@@ -96,44 +78,8 @@ FORMULAS = 0.5  # log error by which a curve may be worse than the best, and a f
 SPLINES = 28  # of the best finalists where they still fail
 
 
-class Learner:
-    """The search for curves on one stage.
-
-    ground    the stage on its logs
-    d         what `diagnose` says of it
-    progress  called with the share that is done
-    shape     what is known of every curve (`identification.unmodelled.curve_candidates.SHAPES`)
-    speaks    whether a formula that does as well as its curve will be the law
-    """
-
-    def __init__(
-        self, ground: Ground, d: StageDiagnosis, progress: Callable[[float], None] | None = None,
-        shape: Sequence[str] = (), speaks: bool = True,
-    ):  # fmt: skip
-        self.ground, self.d, self.progress, self.shape = ground, d, progress or (lambda _: None), tuple(shape)
-        self.speaks = speaks
-        self.ranked: list[list[Tried]] = []  # of each search for a curve, what was fitted, best first
-        self.judge = self._judge((), ())
-        self.base = self.judge.fit((), d.base.theta[: len(self.judge.stage.parameters)], 4)
-        self.form = ErrorShare(self.judge)
-        self.form.begin(self.base)
-        self.faint = ground.noise_known and not self.form.fails(self.base)
-        if self.faint:
-            in_grains(ground, grain_of(self.judge, self.base), [self.judge])
-        self.candidates = [s for c in ground.candidates(self.base.theta) if (s := c.shaped(shape)) is not None]
-
-    def _judge(
-        self, laws: Sequence[str], curves: Placings, quick: bool = False, keep: Array | None = None
-    ) -> Judge:  # fmt: skip
-        return Judge(self.ground.stage(laws, curves, quick), self.ground.floor, keep)
-
-    def fails(self, tried: Tried) -> bool:
-        """Whether there is any error beyond noise where it is judged."""
-        return ErrorShare(tried.judge).fails(tried.fit)
-
-    def each(self, f: Callable[[Item], Answer], items: Iterable[Item]) -> Iterator[Answer]:
-        """`side_by_side` where the ground's models allow it."""
-        return side_by_side(f, items, self.ground.shares)
+class Learner(CurveProblem):
+    """The search for curves on one subsystem."""
 
     def learned(self) -> Outcome:
         """Curves one after the other, each earning its place; at most two."""
@@ -159,7 +105,7 @@ class Learner:
             good += only_said
             if not good:
                 break
-            left = {t.candidate.name: self._left(current, t, good) for t in good}
+            left = {t.candidate.name: self.left(current, t, good) for t in good}
             self._with_formulas(current, good, left)
             good = harmless(self, current, good, left)
             good = without_memory(self, current, good)
@@ -199,11 +145,11 @@ class Learner:
         learned, "" if it is: it harms a test log, and no formula that does as well is harmless.
         """
         best = self._settled(current, self._with_its_lag(current, tried, TIMES[1:]))
-        why = self._harmful(current, best)
+        why = self.harmful(current, best)
         if why or self.fails(best):
             best.formulas = fitted_formulas(self.ground, best)
         for _, f in best.formulas or () if why and self.speaks else ():
-            if not self._harmful(current, f) and self._score(f, [f, best]) <= self._score(best, [f, best]) + RIVAL:
+            if not self.harmful(current, f) and self.score(f, [f, best]) <= self.score(best, [f, best]) + RIVAL:
                 why = ""
         return best, why
 
@@ -214,8 +160,8 @@ class Learner:
         gone = {*range(own[first.candidate.name].start, own[first.candidate.name].stop)}
         theta = np.array([v for k, v in enumerate(second.fit.theta) if k not in gone])
         nothing = Tried(second.candidate, 0.0, self.judge, self.base, ())
-        alone = self._fitted(nothing, second.candidate, second.wiggle, theta, 16)
-        if self._score(alone, [alone, first]) <= self._score(second, [alone, first]) + BETTER:
+        alone = self.fitted(nothing, second.candidate, second.wiggle, theta, 16)
+        if self.score(alone, [alone, first]) <= self.score(second, [alone, first]) + BETTER:
             out.tried = [replace(alone, told=second.told, rivals=second.rivals)]
 
     def _named(self) -> tuple[Judge, Fit] | None:
@@ -223,7 +169,7 @@ class Learner:
         effects = self.d.final.effects or tuple(self.d.nearest[:1])
         if not effects:
             return None
-        judge = self._judge(effects, ())
+        judge = self.judge_of(effects, ())
         theta = judge.stage.neutral()
         whole, part = self.ground.whole.index(), judge.stage.index()
         theta[: len(self.base.theta)] = self.d.final.theta[: len(self.base.theta)]
@@ -257,56 +203,13 @@ class Learner:
         """The laws of the library, to hold a candidate against them."""
         return Tried(candidate, 0.0, judge, fit, (), errors=self.ground.errors((), fit.theta, fit.effects))
 
-    def _known(self, among: Sequence[Tried]) -> Array:
-        """Samples where all these curves are told by more than one block."""
-        start, n = self.judge.block_start, len(self.judge.stage.t)
-        known = np.ones(n, dtype=bool)
-        for q in {q.name: q for t in among for q, _ in t.candidate.axes}.values():
-            if (values := at_samples(q.visited, n)) is not None:
-                known &= told_by_others(values, start)
-        for settled in (t.settled for t in among):
-            known &= True if settled is None else settled
-        return known if known.any() else ~known
-
-    def _judged(self, tried: Tried, among: Sequence[Tried]) -> tuple[Judge, Fit]:
-        """A fit with its held-out errors, where all curves of ``among`` know something."""
-        known = self._known(among)
-        if known.all():
-            return self.judge, tried.fit
-        judge = Judge(self.judge.stage, self.ground.floor, keep=known)
-        return judge, with_held_out(tried.judge, tried.fit, tried.counted(known))
-
-    def _score(self, tried: Tried, among: Sequence[Tried] = ()) -> float:
-        """What orders curves: `score`, where all of ``among`` (default: itself) know something."""
-        return score(*self._judged(tried, among or [tried]))
-
-    def _worth(self, before: Tried, tried: Tried) -> bool:
-        """Whether a curve earns its place, where it knows something and what it is held against does."""
-        among = [tried, before] if before.curves else [tried]
-        (judge, was), (_, now) = (self._judged(t, among) for t in (before, tried))
-        if self.faint:
-            return earns(judge, was, now, correlation_of(tried.judge, tried.fit))
-        return worth(judge, was, now, self.form.form).good
-
     def _earns(self, before: Tried, tried: Tried) -> bool:
         c = tried.candidate
         if c.quantity.stops:
             table, amplitudes = tried.table()
             if not dissipates(c.basis.low, c.basis.high, table(amplitudes)):
                 return False
-        return self._worth(before, tried)
-
-    def _left(self, before: Tried, tried: Tried, among: Sequence[Tried]) -> float:
-        """What orders candidates ``among`` which one is chosen: the score and what each makes of the test logs."""
-        return self._score(tried, among) + self._tested(before, tried, among)
-
-    def _tested(self, before: Tried, tried: Tried, among: Sequence[Tried]) -> float:
-        """Log of what a curve makes of the test logs' error, where all of ``among`` know something."""
-        inside = [self.ground.within(t.candidate) for t in among]
-        part = {log: np.logical_and.reduce([i[log] for i in inside if log in i]) for i in inside for log in i}
-        change = self._change(before, tried, part)
-        tests = [c for log, c in change.items() if log in self.ground.tests]
-        return float(np.mean(tests)) if tests else 0.0
+        return self.worth(before, tried)
 
     def _with_formulas(self, before: Tried, good: Sequence[Tried], left: dict[str, float]) -> None:
         """Where the best curve still fails, or harms a test log, what each may leave with a formula in its place, else
@@ -319,7 +222,7 @@ class Learner:
         close = [t for t in good if any(c[t.candidate.name] <= c[best.candidate.name] + FORMULAS for c in costs)]
         close += [t for t in at_its_place(before, good) if t not in close]
         first = close
-        if not (self.fails(best) or self._harmful(before, best)):
+        if not (self.fails(best) or self.harmful(before, best)):
             first = [t for t in close if strange(t.candidate) < strange(best.candidate)]
         sparest, least = min(len(t.fit.free) for t in (*close, best)), left[best.candidate.name]
         for some in (first, [t for t in close if t not in first]):
@@ -328,7 +231,7 @@ class Learner:
                 name = t.candidate.name
                 for f in t.loose or ():
                     spared = PER_PARAMETER * (sparest - len(f.fit.free))
-                    left[name] = min(left[name], self._left(before, f, good) + max(spared, 0.0))
+                    left[name] = min(left[name], self.left(before, f, good) + max(spared, 0.0))
             if min((left[t.candidate.name] for t in first), default=least) >= least:
                 break
 
@@ -342,7 +245,7 @@ class Learner:
         if best is None or self.fails(best):
             return
         for t in plain_ones:
-            (_, worse), (_, fit) = (self._judged(one, [t, best]) for one in (t, best))
+            (_, worse), (_, fit) = (self.judged(one, [t, best]) for one in (t, best))
             if surely_more((worse.held_out - fit.held_out)[self.judge.samples > 0]):
                 left[t.candidate.name] = max(left[t.candidate.name], left[best.candidate.name] + 2.0 * RIVAL)
 
@@ -374,9 +277,9 @@ class Learner:
         """
         if not adds_what(tried.candidate, best.candidate):
             return False
-        if self._worth(tried, best):
+        if self.worth(tried, best):
             return False
-        mine, its = (self._tested(before, t, [tried, best]) for t in (tried, best))
+        mine, its = (self.tested(before, t, [tried, best]) for t in (tried, best))
         return mine < its + HARM
 
     def _with_its_lag(self, current: Tried, best: Tried, steps: Sequence[float]) -> Tried:
@@ -394,8 +297,8 @@ class Learner:
         """The curve with a lag so many times as long; None where that is no better."""
         if (slower := best.candidate.slower(times)) is None or stands(current, slower):
             return None
-        more = self._fitted(current, slower, best.wiggle, self._begun(best, slower), 12, slopes=best.slopes())
-        (judge, now), (_, was) = (self._judged(t, [more, best]) for t in (more, best))
+        more = self.fitted(current, slower, best.wiggle, self._begun(best, slower), 12, slopes=best.slopes())
+        (judge, now), (_, was) = (self.judged(t, [more, best]) for t in (more, best))
         worse = score(judge, now) - score(judge, was)
         # within the noise the score does not tell: what is left there still does
         falls = 0.5 * float(np.log(was.held_out.sum() / now.held_out.sum()))
@@ -423,10 +326,10 @@ class Learner:
             if len(c.kept) == len(whole.kept) or not c.kept:
                 continue
             bends = [found[k] for k in c.parts]
-            with told_in_nats(self, best):
-                fits = [self._fitted(current, c, best.wiggle, np.append(n, bends), 16, False, near) for n in nominal]
-                simpler = min(fits, key=self._score)
-                as_well = self._score(simpler) <= self._score(best) + BETTER
+            with self.told_in_nats(best):
+                fits = [self.fitted(current, c, best.wiggle, np.append(n, bends), 16, False, near) for n in nominal]
+                simpler = min(fits, key=self.score)
+                as_well = self.score(simpler) <= self.score(best) + BETTER
             if as_well:
                 simpler.judge.stage.grain = best.judge.stage.grain
                 return replace(simpler, told=best.fit)
@@ -441,13 +344,13 @@ class Learner:
         if self.faint and not (promising and promises(bare, promising[0][0])):
             return []
         steps = MANY_STEPS if not self.ground.noise_known and bare > FAR_OFF**2 * self.judge.n else FEW_STEPS
-        few = lambda p: self._fitted(current, p[1], SCREENED, p[2], steps, True, near)  # noqa: E731
+        few = lambda p: self.fitted(current, p[1], SCREENED, p[2], steps, True, near)  # noqa: E731
         for k, t in enumerate(self.each(few, promising)):
             quick.append(t)
             self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
         short = len(quick[0].judge.stage.t) < len(self.judge.stage.t) if quick else False
         if short and not all(self.fails(t) for t in quick):  # where an excerpt does not tell them apart, all samples do
-            quick = [self._fitted(current, t.candidate, SCREENED, t.fit.theta, 1) for t in quick]
+            quick = [self.fitted(current, t.candidate, SCREENED, t.fit.theta, 1) for t in quick]
         quick.sort(key=lambda t: score(t.judge, t.fit))
         self.ranked.append(list(quick))
         quick, done = one_constant(quick), []
@@ -467,7 +370,7 @@ class Learner:
             nearest = min(done, key=lambda t: rms_of(t.judge, t.fit))
             grain = grain_of(nearest.judge, nearest.fit)
             in_grains(self.ground, grain, [self.judge, *(t.judge for t in (*quick, *done))])
-        done = self._ordered(done)
+        done = self.ordered(done)
         if done:  # what is plainer may say the same
             leader, have = done[0].candidate, {t.candidate.name for t in done}
             reach = min(score(t.judge, t.fit) for t in quick) + NEAR
@@ -477,24 +380,20 @@ class Learner:
             plainer = [t for t in plainer if t.candidate.name in alike or score(t.judge, t.fit) < reach]
             plainer.sort(key=lambda t: (t.candidate.name not in alike, t.candidate.at != leader.at))
             more = dict.fromkeys([*plainer[:PLAINER], *home])
-            done = self._ordered([*done, *self.each(lambda t: self._finished(current, t), more)])
+            done = self.ordered([*done, *self.each(lambda t: self._finished(current, t), more)])
         if done and self.fails(done[0]):  # a curve may turn more often than its splines
-            best = self._score(done[0], done)
-            close = [t for t in done if self._score(t, done) < best + NEAR or without_its_lag(t, done[0])]
+            best = self.score(done[0], done)
+            close = [t for t in done if self.score(t, done) < best + NEAR or without_its_lag(t, done[0])]
             more_splines = zip(close, self.each(lambda t: self._finer(current, t), close), strict=True)
             finer = {t: f for t, f in more_splines if f is not None}
             home = at_its_place(current, done)
-            close = [t for t in done if t in home or self._score(t, done) < best + FORMULAS]
+            close = [t for t in done if t in home or self.score(t, done) < best + FORMULAS]
             jumping = [j for j in self.each(lambda t: self._jumping(current, t), close) if j is not None]
-            coarse = [t for t in done if t in finer and self._worth(t, finer[t])]  # a second law would patch them
-            done = self._ordered([*(t for t in done if t not in coarse), *finer.values(), *jumping])
+            coarse = [t for t in done if t in finer and self.worth(t, finer[t])]  # a second law would patch them
+            done = self.ordered([*(t for t in done if t not in coarse), *finer.values(), *jumping])
             first_of = {t.candidate.name: t for t in reversed(done)}
             done = [t for t in done if first_of[t.candidate.name] is t]
         return done
-
-    def _ordered(self, tried: Sequence[Tried]) -> list[Tried]:
-        """The best first."""
-        return sorted(tried, key=lambda t: self._score(t, tried))
 
     def _finished(self, current: Tried, quick: Tried) -> Tried:
         """A candidate fitted to the end, as smooth and with the lag that suits it best."""
@@ -509,7 +408,7 @@ class Learner:
         """The same curve with `SPLINES` splines."""
         if (fine := coarse.candidate.finer(SPLINES)) is None:
             return None
-        return self._fitted(current, fine, WIGGLES[-1], self._begun(coarse, fine), 12, slopes=coarse.slopes())
+        return self.fitted(current, fine, WIGGLES[-1], self._begun(coarse, fine), 12, slopes=coarse.slopes())
 
     def _jumping(self, current: Tried, smooth: Tried) -> Tried | None:
         """The same curve with a jump where its quantity is 0."""
@@ -519,50 +418,4 @@ class Learner:
         begun = replace(smooth.fit, theta=np.append(smooth.fit.theta, 0.0))
         return self._finished(current, replace(smooth, candidate=c, fit=begun))
 
-    def _fitted(
-        self, current: Tried, candidate: Candidate, wiggle: float, begin: Array | Fit, iterations: int,
-        quick: bool = False, slopes: Known = NOT_KNOWN,
-    ) -> Tried:  # fmt: skip
-        """A candidate fitted beside the model and its curves; ``begin``: parameters, or its fit as smooth as another
-        ``wiggle`` makes it, on the same samples; ``slopes`` near there, as far as they are known.
-        """
-        curves: Placings = (*current.curves, (candidate.placed(), candidate.effect(wiggle)))
-        settled = [s for s in (current.settled, candidate.settled) if s is not None and not quick]
-        judge = self._judge((), curves, quick, np.logical_and.reduce(settled) if settled else None)
-        judge.sparing = True
-        names = tuple(e.name for _, e in curves)
-        fit = with_held_out(judge, judge.fit(names, begin, iterations, slopes=slopes))
-        return Tried(candidate, wiggle, judge, fit, curves)
-
     # ---- other logs --------------------------------------------------------------------------------------------------
-
-    def _harmful(self, before: Tried, tried: Tried) -> str:
-        """Why the logs speak against a curve; "": they do not."""
-        change = self._change(before, tried)
-        if self.faint and (why := unconfirmed(before.errors or {}, tried.errors or {}, self.ground.tests)):
-            return why
-        worst = max((log for log in change if log in self.ground.tests), key=lambda log: change[log], default=None)
-        if worst is not None and change[worst] > HARM:
-            return f"makes {worst} worse: {np.exp(change[worst]):.2f} times the error"
-        if change and min(change.values()) > -LEAST_USE:
-            return f"no log is better by {LEAST_USE:.0%} for it"
-        return ""
-
-    def _change(self, before: Tried, tried: Tried, part: Mapping[str, Array] | None = None) -> dict[str, float]:
-        """Log of the error with a curve over that without, log by log; ``part``: of these logs, of these samples."""
-        was, now = self._levels(before, part or {}), self._levels(tried, part or {})
-        return {log: now[log] - was[log] for log in was if log in now}
-
-    def _levels(self, of: Tried, part: Mapping[str, Array]) -> dict[str, float]:
-        if of.errors is None:
-            of.errors = self.ground.errors(of.curves, of.fit.theta)
-        out = {}
-        for log, e in of.errors.items():
-            some = e[:, part[log]] if log in part else e
-            if self.faint:
-                out[log] = 0.5 * float(np.log(np.nanmean(some**2))) / self.judge.stage.grain
-                continue
-            rms = rms_of_rows(some)
-            if np.isfinite(rms).all():
-                out[log] = float(np.log(np.maximum(rms, 1.0)).mean())
-        return out

@@ -10,9 +10,7 @@ And samples that nothing was fitted to must say so by themselves.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -28,12 +26,9 @@ from vaneloop.identification.selection.likelihood_acceptance import (
 )
 from vaneloop.identification.selection.relative_error_acceptance import RIVAL
 from vaneloop.identification.subsystem import Array
+from vaneloop.identification.unmodelled.fitted_candidate import Ground
 
-if TYPE_CHECKING:
-    from vaneloop.identification.unmodelled.fitted_candidate import Ground, Tried
-    from vaneloop.identification.unmodelled.learning import Learner
-
-__all__ = ["above_the_noise", "earns", "grain_of", "in_grains", "promises", "told_in_nats", "unconfirmed"]
+__all__ = ["above_the_noise", "earns", "grain_of", "in_grains", "promises", "unconfirmed"]
 
 
 def above_the_noise(judge: Judge, fit: Fit) -> bool:
@@ -55,20 +50,6 @@ def in_grains(ground: Ground, grain: float, judges: Iterable[Judge]) -> None:
     ground.in_grains(grain)
     for judge in judges:
         judge.stage.grain = grain
-
-
-@contextmanager
-def told_in_nats(learner: Learner, tried: Tried) -> Iterator[None]:
-    """Compare errors in nats meanwhile, if a curve leaves nothing but a noise that is known: 1 % of the error there can
-    be a hundred nats.
-    """
-    grain = learner.judge.stage.grain
-    if learner.ground.noise_known and grain == 1.0 and not learner.fails(tried):
-        in_grains(learner.ground, grain_of(tried.judge, tried.fit), [learner.judge])
-    try:
-        yield
-    finally:
-        in_grains(learner.ground, grain, [learner.judge])
 
 
 def promises(bare: float, best: float) -> bool:

@@ -8,7 +8,6 @@ alone has been. A formula that does as well says more there, and it is what the 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 from vaneloop.base.side_by_side import side_by_side
 from vaneloop.identification.results import rms_of
@@ -16,9 +15,7 @@ from vaneloop.identification.selection.likelihood_acceptance import correlation_
 from vaneloop.identification.selection.relative_error_acceptance import MOST_LEFT
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
 from vaneloop.identification.unmodelled.fitted_candidate import MEASURED, Ground, Tried, strange
-
-if TYPE_CHECKING:
-    from vaneloop.identification.unmodelled.learning import Learner
+from vaneloop.identification.unmodelled.problem import CurveProblem
 
 __all__ = [
     "all_in_their_place",
@@ -58,34 +55,36 @@ def at_its_place(before: Tried, good: Sequence[Tried]) -> list[Tried]:
     return [t for t in good if strange(t.candidate) == 0 and float(t.fit.cost.sum()) / max(t.judge.n, 1) <= most]
 
 
-def earning_by_formula(learner: Learner, before: Tried, poor: Sequence[Tried], among: Sequence[Tried]) -> list[Tried]:
+def earning_by_formula(
+    learner: CurveProblem, before: Tried, poor: Sequence[Tried], among: Sequence[Tried]
+) -> list[Tried]:
     """Of curves that do not earn their place, but are near the best of ``among`` or explain most of the error at their
     place itself, those of which a formula does; none of what remembers. A block that alone has been somewhere says
     nothing of splines there, and much of a formula.
     """
-    reach, home = min((learner._score(t, among) for t in among), default=0.0) + NEAR, at_its_place(before, poor)
-    near = [t for t in poor if t in home or learner._score(t, among) < reach]
+    reach, home = min((learner.score(t, among) for t in among), default=0.0) + NEAR, at_its_place(before, poor)
+    near = [t for t in poor if t in home or learner.score(t, among) < reach]
     near = [t for t in near if not t.candidate.quantity.remembers]
     said = all_in_their_place(learner.ground, near)
-    return [t for t, formulas in zip(near, said, strict=True) if any(learner._worth(before, f) for f in formulas)]
+    return [t for t, formulas in zip(near, said, strict=True) if any(learner.worth(before, f) for f in formulas)]
 
 
-def harmless(learner: Learner, before: Tried, good: list[Tried], left: Mapping[str, float]) -> list[Tried]:
+def harmless(learner: CurveProblem, before: Tried, good: list[Tried], left: Mapping[str, float]) -> list[Tried]:
     """Of curves those that harm no test log, or of which a formula does not, if one is near the best; else all.
 
     left  what orders them, by name
     """
-    fine = [t for t in good if any(not learner._harmful(before, f) for f in (t, *(t.loose or ())))]
+    fine = [t for t in good if any(not learner.harmful(before, f) for f in (t, *(t.loose or ())))]
     reach = min(left[t.candidate.name] for t in good) + FAR
     return fine if any(left[t.candidate.name] < reach for t in fine) else good
 
 
-def without_memory(learner: Learner, before: Tried, good: list[Tried]) -> list[Tried]:
+def without_memory(learner: CurveProblem, before: Tried, good: list[Tried]) -> list[Tried]:
     """Without what remembers, where a memoryless curve leaves nothing but noise, and harms no test log: memory imitates
     much.
     """
     plain = [t for t in good if not t.candidate.quantity.remembers]
-    enough = any(not learner.fails(t) and not learner._harmful(before, t) for t in plain)
+    enough = any(not learner.fails(t) and not learner.harmful(before, t) for t in plain)
     return plain if enough else good
 
 
@@ -99,7 +98,7 @@ def with_and_without_mean(ground: Ground, tried: Tried) -> list[Tried]:
     return [*strict, *(f for f in tried.loose if f not in strict)]
 
 
-def said_first(learner: Learner, near: list[Tried], left: Mapping[str, float]) -> list[Tried]:
+def said_first(learner: CurveProblem, near: list[Tried], left: Mapping[str, float]) -> list[Tried]:
     """Those that do as well, plainest first, but before all others the plainest that a formula says, where the best of
     measured channels leaves nothing but a noise that is known. A channel that follows the right one has a curve that
     does as well, and seldom a formula.
@@ -114,9 +113,9 @@ def said_first(learner: Learner, near: list[Tried], left: Mapping[str, float]) -
         return near
     formulas = [(t, f) for t in among for f in with_and_without_mean(learner.ground, t)]
     every = [*among, *(f for _, f in formulas)]
-    squares = {id(t): float(learner._judged(t, every)[1].held_out.sum()) for t in every}
+    squares = {id(t): float(learner.judged(t, every)[1].held_out.sum()) for t in every}
     best = min(every, key=lambda t: squares[id(t)])
-    judge, correlation = learner._judged(best, every)[0], correlation_of(best.judge, best.fit)
+    judge, correlation = learner.judged(best, every)[0], correlation_of(best.judge, best.fit)
     nats = rival_nats(judge, squares[id(best)], correlation)
     said = {id(t) for t, f in formulas if squares[id(f)] - squares[id(best)] <= 2.0 * correlation * nats}
     first = next((t for t in among if id(t) in said), near[0])
@@ -128,6 +127,6 @@ def leaves(tried: Tried) -> float:
     return min(rms_of(t.judge, t.fit) for t in (tried, *(f for _, f in tried.formulas or ())))
 
 
-def better_than(learner: Learner, before: Tried, tried: Tried) -> bool:
+def better_than(learner: CurveProblem, before: Tried, tried: Tried) -> bool:
     """Whether a curve, or a formula in its place, earns its place before something else."""
-    return any(learner._worth(before, t) for t in (tried, *(f for _, f in tried.formulas or ())))
+    return any(learner.worth(before, t) for t in (tried, *(f for _, f in tried.formulas or ())))

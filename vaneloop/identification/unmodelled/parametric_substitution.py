@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,17 +24,17 @@ from vaneloop.identification.unmodelled.closed_form_fits import effect_of, fitte
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
 from vaneloop.identification.unmodelled.fitted_candidate import Ground, Tried, with_held_out
 from vaneloop.identification.unmodelled.learned_law import LearnedLaw
+from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.user_models.terms import runs
-
-if TYPE_CHECKING:
-    from vaneloop.identification.unmodelled.learning import Learner
 
 __all__ = ["more_left", "spoken", "takes_mean_back", "tell_each_by_its_formula"]
 
 LEAST = 0.1  # share of a parameter that may be left when a formula takes its mean back
 
 
-def spoken(learner: Learner, curves: Sequence[Tried], laws: Sequence[LearnedLaw]) -> tuple[Tried, list[LearnedLaw]]:
+def spoken(
+    learner: CurveProblem, curves: Sequence[Tried], laws: Sequence[LearnedLaw]
+) -> tuple[Tried, list[LearnedLaw]]:
     """The model with a formula in place of each curve that one does as well as, fitted together; and the laws with
     these formulas.
 
@@ -78,7 +77,7 @@ def spoken(learner: Learner, curves: Sequence[Tried], laws: Sequence[LearnedLaw]
     return now, out
 
 
-def tell_each_by_its_formula(learner: Learner, first: Tried, second: Tried) -> None:
+def tell_each_by_its_formula(learner: CurveProblem, first: Tried, second: Tried) -> None:
     """Formulas of two curves that stand beside each other: alone, what the second one says is in the first one's error,
     and leads its formulas astray. Where a formula of the first leaves less than both curves do, the second one has its
     formulas beside that.
@@ -87,12 +86,12 @@ def tell_each_by_its_formula(learner: Learner, first: Tried, second: Tried) -> N
         return
     first.formulas = _formulas_beside(learner, first, second)
     said = [second, *(t for _, t in first.formulas)]
-    best = min(said, key=lambda t: learner._score(t, said))
+    best = min(said, key=lambda t: learner.score(t, said))
     if best is not second and learner.fails(second) and learner.speaks and not second.candidate.quantity.stops:
         second.formulas = _formulas_beside(learner, second, best)
 
 
-def _formulas_beside(learner: Learner, tried: Tried, pair: Tried) -> list[tuple[Formula, Tried]]:
+def _formulas_beside(learner: CurveProblem, tried: Tried, pair: Tried) -> list[tuple[Formula, Tried]]:
     """Formulas of a curve as it is in a model with another one."""
     name = tried.candidate.name
     curves = (*(c for c in pair.curves if c[1].name != name), *(c for c in pair.curves if c[1].name == name))
@@ -111,13 +110,13 @@ def _as_in(tried: Tried, judge: Judge, but: str = "") -> Array:
     return theta
 
 
-def more_left(learner: Learner, before: Tried, tried: Tried, among: Sequence[Tried]) -> tuple[float, list[float]]:
+def more_left(learner: CurveProblem, before: Tried, tried: Tried, among: Sequence[Tried]) -> tuple[float, list[float]]:
     """Log of what a formula leaves over what stood there before it: held out where all of ``among`` know something,
     whatever numbers it has; and of each test log, over all its samples.
     """
-    held = learner._score(tried, among) - learner._score(before, among)
+    held = learner.score(tried, among) - learner.score(before, among)
     held -= PER_PARAMETER * (len(tried.fit.free) - len(before.fit.free))
-    return held, [v for log, v in learner._change(before, tried).items() if log in learner.ground.tests]
+    return held, [v for log, v in learner.change(before, tried).items() if log in learner.ground.tests]
 
 
 def takes_mean_back(level: float, numbers: Array, own: Array, place: int) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from vaneloop.base.durations import folded
 from vaneloop.identification.selection.relative_error_acceptance import FORM
 from vaneloop.identification.subsystem import Array
-from vaneloop.identification.user_models.bound_system import Bound
+from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.data import noise_of_channel
 from vaneloop.identification.user_models.exogenous_regressors import DISTANCE, MINUS, SINCE, TIME, WAY
 from vaneloop.identification.user_models.hysteresis_regressors import STOPS, is_memory, lagged_name
@@ -72,7 +72,7 @@ class Quantity:
         return is_memory(self.name)
 
 
-def quantities(bound: Bound, values: Array, states: Sequence[Sequence[Array]] | None = None) -> list[Quantity]:
+def quantities(bound: BoundSystem, values: Array, states: Sequence[Sequence[Array]] | None = None) -> list[Quantity]:
     """Every quantity that is known, with the values that it has in the fitted logs; ``values``: the model's own
     parameters, and starts; ``states``: their courses as `nominal_course` has them, where they are known.
     """
@@ -113,7 +113,7 @@ def quantities(bound: Bound, values: Array, states: Sequence[Sequence[Array]] | 
     return [*out, *_differences(bound, values, out), *_remembering(bound, shared)]
 
 
-def _differences(bound: Bound, values: Array, have: Sequence[Quantity]) -> list[Quantity]:
+def _differences(bound: BoundSystem, values: Array, have: Sequence[Quantity]) -> list[Quantity]:
     """Differences of states and of what drives the model, of one unit: what flows, slips and bends between two. None of
     one that is a multiple of a quantity that is there by then, as far as any law tells.
     """
@@ -134,7 +134,7 @@ def _differences(bound: Bound, values: Array, have: Sequence[Quantity]) -> list[
     return out
 
 
-def difference(bound: Bound, a: Array, b: Array) -> Array:
+def difference(bound: BoundSystem, a: Array, b: Array) -> Array:
     """The difference of two quantities on all samples of the logs in ``bound``.
 
     Two readings that go nearly together differ by little more than their noise, which the model has not: what lies
@@ -156,7 +156,7 @@ def _alike(one: Array, other: Array) -> bool:
     return not float(x @ x) > 0.0 or (size > 0.0 and abs(float(x @ y)) > np.sqrt(1.0 - FORM**2) * size)
 
 
-def _acting(bound: Bound, values: Array, visited: Mapping[str, Array]) -> set[tuple[str, str]]:
+def _acting(bound: BoundSystem, values: Array, visited: Mapping[str, Array]) -> set[tuple[str, str]]:
     """Pairs of channels of which the model has one taken off from the other: in some derivative they stand with
     opposite signs, at most places of the logs.
     """
@@ -182,7 +182,7 @@ def _acting(bound: Bound, values: Array, visited: Mapping[str, Array]) -> set[tu
     return {(a, b) for i, a in enumerate(visited) for j, b in enumerate(visited) if opposed[i, j]}
 
 
-def _remembering(bound: Bound, shared: set[str]) -> list[Quantity]:
+def _remembering(bound: BoundSystem, shared: set[str]) -> list[Quantity]:
     """Lags of what drives the model, and stops that it moves. What the model gives is none of them: its measured course
     would tell the model what it has to say.
     """

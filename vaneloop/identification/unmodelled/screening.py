@@ -15,12 +15,12 @@ from vaneloop.identification.selection.screening import Slopes
 from vaneloop.identification.subsystem import Array, Effect
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
 from vaneloop.identification.unmodelled.fitted_candidate import Placings, Tried, channel_of, stands, strange
+from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.unmodelled.spectral_lines import Course, Lines, periods_along
 from vaneloop.identification.user_models.exogenous_regressors import TIME
 
 if TYPE_CHECKING:
     from vaneloop.identification.least_squares.problem import Fit
-    from vaneloop.identification.unmodelled.learning import Learner
 
 __all__ = ["SCREENED", "Step", "best_step", "screened", "smoothed", "starts_of"]
 
@@ -33,13 +33,13 @@ Promise = tuple[float, Candidate, Array]  # what a candidate would leave, and pa
 Starts = Sequence[tuple[Array, Slopes]]
 
 
-def screened(learner: Learner, current: Tried, many: int, apart: float) -> tuple[float, list[Promise]]:
+def screened(learner: CurveProblem, current: Tried, many: int, apart: float) -> tuple[float, list[Promise]]:
     """What a step of the model's own parameters leaves; and the ``many`` best candidates, and the best at each other
     place, best first.
 
     apart  by which times a lag is changed: those that are tried first are far apart
     """
-    starts = starts_of(learner._judge((), current.curves, True), current.fit)
+    starts = starts_of(learner.judge_of((), current.curves, True), current.fit)
     bare = starts[0][1].left(starts[0][1].error)[0]
     every = [c for c in (*learner.candidates, *_periodic(learner, current)) if not stands(current, c)]
     steps = list(learner.each(lambda c: _promise(learner, current, c, starts), every))
@@ -71,7 +71,7 @@ def _one_lag(promises: Iterable[Promise]) -> list[Promise]:
 
 
 def _straightened(
-    learner: Learner, current: Tried, bare: float, steps: Sequence[tuple[Promise, float]], many: int
+    learner: CurveProblem, current: Tried, bare: float, steps: Sequence[tuple[Promise, float]], many: int
 ) -> list[Promise]:
     """All candidates, best first; those fitted for some steps that one step does no justice. A tank's level goes with
     one over its outflow: where that is off by half, no step by slopes brings what its gain can.
@@ -83,14 +83,14 @@ def _straightened(
 
     def fitted(p: Promise) -> Promise:
         begin = p[2] if p[0] < bare else np.append(current.fit.theta, np.zeros(len(p[2]) - len(current.fit.theta)))
-        few = learner._fitted(current, p[1], SCREENED, begin, FEW, True).fit
+        few = learner.fitted(current, p[1], SCREENED, begin, FEW, True).fit
         return min(p, (float(few.cost.sum()), p[1], few.theta), key=lambda o: o[0])
 
     gone = {id(p) for p in chosen}
     return sorted([*learner.each(fitted, chosen), *(p for p in out if id(p) not in gone)], key=lambda o: o[0])
 
 
-def _its_lag(learner: Learner, current: Tried, one: Promise, starts: Starts, apart: float) -> Promise:
+def _its_lag(learner: CurveProblem, current: Tried, one: Promise, starts: Starts, apart: float) -> Promise:
     """A candidate with the lag that promises most."""
     for factor in (apart, 1.0 / apart) if one[1].quantity.remembers else ():
         while (c := one[1].slower(factor)) is not None and not stands(current, c):
@@ -101,7 +101,7 @@ def _its_lag(learner: Learner, current: Tried, one: Promise, starts: Starts, apa
     return one
 
 
-def _periodic(learner: Learner, current: Tried) -> list[Candidate]:
+def _periodic(learner: CurveProblem, current: Tried) -> list[Candidate]:
     """Every curve that may repeat itself, over time or along another channel, with the periods of the error; none where
     a shape is known.
     """
@@ -112,7 +112,7 @@ def _periodic(learner: Learner, current: Tried) -> list[Candidate]:
     return [*_in_time(learner, current, over_time, courses), *_along(learner, courses)]
 
 
-def _along(learner: Learner, courses: Sequence[Course]) -> list[Candidate]:
+def _along(learner: CurveProblem, courses: Sequence[Course]) -> list[Candidate]:
     """Along a state, a motion or another signal, where the ground tells what the model says."""
     out: list[Candidate] = []
     found: dict[str, list[float]] = {}
@@ -134,7 +134,7 @@ def _along(learner: Learner, courses: Sequence[Course]) -> list[Candidate]:
 
 
 def _in_time(
-    learner: Learner, current: Tried, over_time: Sequence[Candidate], courses: Sequence[Course]
+    learner: CurveProblem, current: Tried, over_time: Sequence[Candidate], courses: Sequence[Course]
 ) -> list[Candidate]:  # fmt: skip
     fit, ground = current.fit, learner.ground
     lines = Lines(courses)
@@ -154,14 +154,14 @@ def _in_time(
     return out
 
 
-def _promise(learner: Learner, current: Tried, candidate: Candidate, starts: Starts) -> tuple[Promise, float]:
+def _promise(learner: CurveProblem, current: Tried, candidate: Candidate, starts: Starts) -> tuple[Promise, float]:
     """What a candidate leaves, in the simulation, after one step by the slopes, as damped as suits it best, from where
     that leaves least; and what the slopes there say that it leaves.
 
     Far from the truth slopes say nothing of data left out: that is asked when the candidate has been fitted.
     """
     effect = candidate.effect(SCREENED)
-    judge = learner._judge((), (*current.curves, (candidate.placed(), effect)), True)
+    judge = learner.judge_of((), (*current.curves, (candidate.placed(), effect)), True)
     slips = candidate.quantity.stops  # fitted to the end whatever it promises, from the fit that it follows
     steps = [best_step(current.fit, effect, judge, *s, cut_off=slips) for s in (starts[:1] if slips else starts)]
     left, theta, promised = min(steps, key=lambda s: s.left)
@@ -171,7 +171,7 @@ def _promise(learner: Learner, current: Tried, candidate: Candidate, starts: Sta
         best = (left, candidate, theta)
         for turns in OFF:  # nor is the model where it was, so that its period is not quite the one that was found
             c = candidate.slower(1.0 + turns * candidate.quantity.period / candidate.quantity.span) or candidate
-            few = learner._fitted(current, c, SCREENED, begin, FEW, True).fit
+            few = learner.fitted(current, c, SCREENED, begin, FEW, True).fit
             best = min(best, (float(few.cost.sum()), c, few.theta), key=lambda o: o[0])
         return best, best[0]
     return (left, candidate, theta), promised
@@ -245,17 +245,17 @@ SCREENED = 1.0  # of the standard deviations of a first bend that are tried, the
 
 
 def smoothed(
-    learner: Learner, current: Tried, candidate: Candidate, begin: Array | Fit, wiggles: Sequence[float],
+    learner: CurveProblem, current: Tried, candidate: Candidate, begin: Array | Fit, wiggles: Sequence[float],
     first: float = SCREENED,
 ) -> Tried:  # fmt: skip
     """A candidate fitted to the end, as smooth as suits it best: from the ``first`` of ``wiggles`` smoother, else less
     so, while that helps, each from where the last one ended.
     """
-    best, at = learner._fitted(current, candidate, first, begin, 12), wiggles.index(first)
+    best, at = learner.fitted(current, candidate, first, begin, 12), wiggles.index(first)
     for others in (wiggles[:at][::-1], wiggles[at + 1 :]):
         for wiggle in others if best.wiggle == first else ():
-            more = learner._fitted(current, candidate, wiggle, best.fit, 12)
-            if learner._score(more) >= learner._score(best):
+            more = learner.fitted(current, candidate, wiggle, best.fit, 12)
+            if learner.score(more) >= learner.score(best):
                 break
             best = more
     return best

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,11 +33,9 @@ from vaneloop.identification.unmodelled.closed_form_fits import (
 )  # fmt: skip
 from vaneloop.identification.unmodelled.fitted_candidate import Ground, Tried, with_held_out
 from vaneloop.identification.unmodelled.parametric_substitution import more_left, takes_mean_back
+from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.unmodelled.surface_candidates import SurfaceCandidate
 from vaneloop.identification.user_models.simulation import Placed
-
-if TYPE_CHECKING:
-    from vaneloop.identification.unmodelled.learning import Learner
 
 __all__ = ["Product", "as_the_law", "fitted_products", "likely_products"]
 
@@ -233,7 +230,7 @@ def reach_of(ground: Ground, tried: Tried, formula: Product) -> Ends:
     return own, its
 
 
-def as_the_law(learner: Learner, tried: Tried, formulas: Sequence[Formula]) -> tuple[Tried, Product] | None:
+def as_the_law(learner: CurveProblem, tried: Tried, formulas: Sequence[Formula]) -> tuple[Tried, Product] | None:
     """The simplest product that does as well as its surface, held out and on every test log, in its place as far as it
     goes on; None where there is none.
     """

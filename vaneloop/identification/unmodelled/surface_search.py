@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import combinations, zip_longest
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,12 +15,10 @@ from vaneloop.identification.results import rms_of
 from vaneloop.identification.selection.relative_error_acceptance import RIVAL, UNKNOWN, score
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.fitted_candidate import Outcome, Tried, plain, strange
+from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.unmodelled.screening import SCREENED, smoothed
 from vaneloop.identification.unmodelled.surface_candidates import SPLINES, SurfaceCandidate, may_be_of, surface_of
 from vaneloop.identification.unmodelled.surface_closed_forms import fitted_products
-
-if TYPE_CHECKING:
-    from vaneloop.identification.unmodelled.learning import Learner
 
 __all__ = ["put_surface"]
 
@@ -32,7 +29,7 @@ WIGGLES = (0.03, 0.1, 0.3, SCREENED, 5.0)  # as of curves, in smaller steps
 NEAR = 0.25  # log error within which another surface may still do as well with more splines
 
 
-def put_surface(learner: Learner, out: Outcome) -> None:
+def put_surface(learner: CurveProblem, out: Outcome) -> None:
     """Put a surface in the place of the curves that were learned, where these leave clearly more than noise and it
     earns that.
     """
@@ -46,31 +43,31 @@ def put_surface(learner: Learner, out: Outcome) -> None:
     done = _finished(learner, nothing)
     sums = list(learner.each(lambda t: _sum(learner, nothing, t), done))
     others = [nothing, *([last] if last else []), *sums]
-    good = [t for t in done if all(learner._worth(other, t) for other in others)]
+    good = [t for t in done if all(learner.worth(other, t) for other in others)]
     if not good:
         return
-    left = {t.candidate.name: learner._left(nothing, t, good) for t in good}
+    left = {t.candidate.name: learner.left(nothing, t, good) for t in good}
     for t in good:
         t.formulas = fitted_products(learner.ground, t)
         for _, f in t.formulas:  # the product of two laws may be what splines are not, as a curve's formula
-            left[t.candidate.name] = min(left[t.candidate.name], learner._left(nothing, f, good))
+            left[t.candidate.name] = min(left[t.candidate.name], learner.left(nothing, f, good))
     least = min(left.values())
     near = [t for t in good if left[t.candidate.name] < least + RIVAL]
     best = min(near, key=lambda t: (*plain(t.candidate), left[t.candidate.name]))
-    why = learner._harmful(last or nothing, best)
+    why = learner.harmful(last or nothing, best)
     if why and not any(_does_as_well(learner, last or nothing, best, f) for _, f in best.formulas or ()):
         out.notes.append(f"{best.candidate.name} fits, but is not learned: {why}")
         return
     out.tried = [replace(best, rivals=[t.candidate.name for t in near if t is not best])]
 
 
-def _does_as_well(learner: Learner, before: Tried, surface: Tried, formula: Tried) -> bool:
+def _does_as_well(learner: CurveProblem, before: Tried, surface: Tried, formula: Tried) -> bool:
     """Whether a formula does as well as its surface where that has been learned, and harms no log that goes further."""
-    near = learner._score(formula, [formula, surface]) < learner._score(surface, [formula, surface]) + RIVAL
-    return near and not learner._harmful(before, formula)
+    near = learner.score(formula, [formula, surface]) < learner.score(surface, [formula, surface]) + RIVAL
+    return near and not learner.harmful(before, formula)
 
 
-def _candidates(learner: Learner) -> list[SurfaceCandidate]:
+def _candidates(learner: CurveProblem) -> list[SurfaceCandidate]:
     """The surfaces at every place of pairs of quantities: those that the best curves are of first, and the place's own.
     What acts by another may be nothing by itself, so that others follow.
     """
@@ -88,26 +85,26 @@ def _candidates(learner: Learner) -> list[SurfaceCandidate]:
     return [s for _, one, two in both[:TRIED] if (s := surface_of(one, two)) is not None]
 
 
-def _finished(learner: Learner, nothing: Tried) -> list[Tried]:
+def _finished(learner: CurveProblem, nothing: Tried) -> list[Tried]:
     """The surfaces that promise most, fitted to the end in place of all curves; best first."""
-    one_step = lambda c: learner._fitted(nothing, c, SCREENED, _begin(learner, nothing, c), 1, True)  # noqa: E731
+    one_step = lambda c: learner.fitted(nothing, c, SCREENED, _begin(learner, nothing, c), 1, True)  # noqa: E731
     begun = list(learner.each(one_step, _candidates(learner)))
     begun.sort(key=lambda t: float(t.fit.cost.sum()))
-    few = lambda t: learner._fitted(nothing, t.candidate, SCREENED, t.fit, 5, True)  # noqa: E731
+    few = lambda t: learner.fitted(nothing, t.candidate, SCREENED, t.fit, 5, True)  # noqa: E731
     quick = list(learner.each(few, begun[:QUICK]))
     quick.sort(key=lambda t: score(t.judge, t.fit))
     to_the_end = lambda t: smoothed(learner, nothing, t.candidate, t.fit, WIGGLES)  # noqa: E731
-    done = learner._ordered(list(learner.each(to_the_end, quick[:FINISHED])))
+    done = learner.ordered(list(learner.each(to_the_end, quick[:FINISHED])))
     if done and learner.fails(done[0]):
-        close = [t for t in done if learner._score(t, done) < learner._score(done[0], done) + NEAR]
-        done = learner._ordered(
+        close = [t for t in done if learner.score(t, done) < learner.score(done[0], done) + NEAR]
+        done = learner.ordered(
             [*done, *(f for f in learner.each(lambda t: _finer(learner, nothing, t), close) if f is not None)]
         )
     first_of = {t.candidate.name: t for t in reversed(done)}
     return [t for t in done if first_of[t.candidate.name] is t]
 
 
-def _begin(learner: Learner, nothing: Tried, c: SurfaceCandidate) -> Array:
+def _begin(learner: CurveProblem, nothing: Tried, c: SurfaceCandidate) -> Array:
     """Parameters to begin from: the best curve of either quantity at the same place, where one was fitted alone. A step
     from no law at all goes astray where a state that runs away is one of the quantities.
     """
@@ -129,7 +126,7 @@ def _begin(learner: Learner, nothing: Tried, c: SurfaceCandidate) -> Array:
     return out
 
 
-def _finer(learner: Learner, nothing: Tried, coarse: Tried) -> Tried | None:
+def _finer(learner: CurveProblem, nothing: Tried, coarse: Tried) -> Tried | None:
     """The same surface with `FINE` splines of each quantity."""
     c = coarse.candidate
     assert isinstance(c, SurfaceCandidate)
@@ -143,11 +140,11 @@ def _finer(learner: Learner, nothing: Tried, coarse: Tried) -> Tried | None:
     return smoothed(learner, nothing, fine, theta, WIGGLES, coarse.wiggle)
 
 
-def _sum(learner: Learner, nothing: Tried, whole: Tried) -> Tried:
+def _sum(learner: CurveProblem, nothing: Tried, whole: Tried) -> Tried:
     """The sum of a curve of each of a surface's quantities, at its place."""
     c = whole.candidate
     assert isinstance(c, SurfaceCandidate)
     of = dict(zip(c.pairs, whole.fit.theta[len(nothing.fit.theta) :], strict=True))
     apart = replace(c, additive=True)
     theta = np.concatenate([whole.fit.theta[: len(nothing.fit.theta)], [of[ij] for ij in apart.pairs]])
-    return learner._fitted(nothing, apart, whole.wiggle, theta, 12)
+    return learner.fitted(nothing, apart, whole.wiggle, theta, 12)

@@ -16,7 +16,7 @@ from vaneloop.identification.user_models.law_file import from_file
 from vaneloop.identification.user_models.simulation import Placed, Runner
 from vaneloop.identification.user_models.system import Record, System
 
-__all__ = ["Bound", "rms_of_rows", "steps_seen"]
+__all__ = ["BoundSystem", "rms_of_rows", "steps_seen"]
 
 # Half-width of the interval that later fits may use: in sizes of a parameter that the user calls unknown, and in values
 # that the user gave, which may be wrong by a factor of ten.
@@ -40,7 +40,7 @@ def rms_of_rows(error: Array) -> Array:
     return np.where(n > 0, np.sqrt(np.nansum(error**2, axis=1) / np.maximum(n, 1)), np.nan)
 
 
-class Bound:
+class BoundSystem:
     """A system held against logs: the `Stage`, and which samples belong to which log.
 
     like      take sizes, fitted parameters and cut-off from an earlier one (for test logs)
@@ -66,7 +66,7 @@ class Bound:
         self,
         system: System,
         records: Sequence[Record],
-        like: Bound | None = None,
+        like: BoundSystem | None = None,
         values: Mapping[str, float] | None = None,
         present: Mapping[str, Mapping[str, float]] | None = None,
         curves: Mapping[str, Learned] | None = None,
@@ -246,7 +246,7 @@ class Bound:
             return np.asarray(np.min(out, axis=0))  # a machine that may tip over does so in some draws
         return np.asarray(np.sqrt(np.mean(np.square(out), axis=0)))
 
-    def theta_from(self, other: Bound, theta: Array) -> Array:
+    def theta_from(self, other: BoundSystem, theta: Array) -> Array:
         """Parameters of another log's stage as this one's: initial states that no log tells are fitted to this log."""
         from scipy.optimize import least_squares
 

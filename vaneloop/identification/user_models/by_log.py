@@ -22,7 +22,7 @@ from vaneloop.identification.results import StageDiagnosis, answer_of, at_bound,
 from vaneloop.identification.selection.diagnosis import Judged
 from vaneloop.identification.selection.relative_error_acceptance import ErrorShare
 from vaneloop.identification.subsystem import Array, StageError
-from vaneloop.identification.user_models.bound_system import Bound, rms_of_rows
+from vaneloop.identification.user_models.bound_system import BoundSystem, rms_of_rows
 from vaneloop.identification.user_models.simulation import STARTS_LOADED
 from vaneloop.identification.user_models.system import Record, System
 
@@ -35,8 +35,8 @@ NO_HELP = 0.85  # error with a law over error without it, from which it hardly h
 class Logs:
     """A system held against the logs that it is fitted to, and against those that only test it."""
 
-    fitted: Bound
-    test: Bound | None
+    fitted: BoundSystem
+    test: BoundSystem | None
 
     def errors(self, theta: Array) -> dict[str, Array]:
         """Error of every sample of each output, log by log; NaN where nothing was measured."""
@@ -63,8 +63,8 @@ class Logs:
 def bind(system: System, logs: Sequence[Record], test: Sequence[Record] = (), model: Model | None = None) -> Logs:
     """Put logs into a system, with what a model file says of it."""
     m = model or Model()
-    bound = system.bind(list(logs), values=m.parameters, present=m.effects, curves=m.curves)
-    return Logs(bound, system.bind(list(test), like=bound) if test else None)
+    bound = BoundSystem(system, list(logs), values=m.parameters, present=m.effects, curves=m.curves)
+    return Logs(bound, BoundSystem(system, list(test), like=bound) if test else None)
 
 
 def as_given(logs: Logs, fit: Fit) -> StageDiagnosis:
@@ -241,7 +241,7 @@ def _size(y: Array) -> float:
     return float(np.sqrt(np.nanmean(y**2))) if np.isfinite(y).any() and np.nanmax(np.abs(y)) > 0.0 else 1.0
 
 
-def _loaded(bound: Bound, judge: Judge, d: StageDiagnosis) -> list[str]:
+def _loaded(bound: BoundSystem, judge: Judge, d: StageDiagnosis) -> list[str]:
     """What it would change to start springs with the force that was measured at the start."""
     codes = {q.effect: q.law.code for q in bound.placed}
     springs = [e for e in (*d.final.effects, *bound.present) if codes[e] in HYSTERETIC]
@@ -267,7 +267,7 @@ def _loaded(bound: Bound, judge: Judge, d: StageDiagnosis) -> list[str]:
     return [text + (f", {', '.join(moved)}" if moved else "")]
 
 
-def _seeded(bound: Bound, base: Array, final: Array, effects: tuple[str, ...]) -> Array:
+def _seeded(bound: BoundSystem, base: Array, final: Array, effects: tuple[str, ...]) -> Array:
     """Start of a fit with some laws of the final model: theirs from there, all others absent."""
     out = bound.stage.neutral()
     n = len(bound.stage.parameters)
@@ -307,7 +307,7 @@ BACKWARDS = {
 ROUND = "is a sign the other way round?"
 
 
-def doubts(bound: Bound, judge: Judge, d: StageDiagnosis) -> list[str]:
+def doubts(bound: BoundSystem, judge: Judge, d: StageDiagnosis) -> list[str]:
     """Parameters and laws at their bounds, and signs that physics or convention speak against, a line each."""
     out = []
     fit = d.final
@@ -348,7 +348,7 @@ def _pulled(fit: Fit, judge: Judge, column: int, side: float) -> bool:
     return g * side > 0.0 and a > 0.0 and g * g / a > PULL * float(fit.cost.sum())
 
 
-def _against(bound: Bound) -> list[str]:
+def _against(bound: BoundSystem) -> list[str]:
     """A measured force that takes more power out of the motion than it puts in."""
     if bound.system.kind != "force":
         return []

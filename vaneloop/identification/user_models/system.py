@@ -1,5 +1,5 @@
-"""A user's own model: which channels it explains, how, and where laws may act. `Bound` turns it, with logs, into a
-`Stage`.
+"""A user's own model: which channels it explains, how, and where laws may act. `BoundSystem` turns it,
+with logs, into a `Stage`.
 
 kind         the model is                                  scored
 -----------  --------------------------------------------  -------------------------------------------------------
@@ -17,16 +17,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vaneloop.identification.subsystem import Array, Parameter, StageError
 from vaneloop.identification.user_models.user_laws import Law, check_parameters, is_name
-
-if TYPE_CHECKING:
-    from plant.model import Learned
-    from vaneloop.identification.user_models.bound_system import Bound
 
 __all__ = ["Record", "System", "unknown"]
 
@@ -224,23 +220,3 @@ class System:
     def reading_of(self, output: str) -> str:
         """What an output is called as a place of laws: its sensor, where an input or a state has the same name."""
         return f"{output}_sensor" if output in self.inputs or output in self.states else output
-
-    def bind(
-        self,
-        records: Sequence[Record],
-        like: Bound | None = None,
-        values: Mapping[str, float] | None = None,
-        present: Mapping[str, Mapping[str, float]] | None = None,
-        curves: Mapping[str, Learned] | None = None,
-    ) -> Bound:
-        """Put logs into this system: its stage for the search, its parameters' starts. Raises StageError for a log that
-        cannot be.
-
-        like     a bound whose noise and scales to use: that of the fitted logs, for test logs
-        values   values of the system's parameters from a model file
-        present  laws that the model has by now, effect name -> parameters; they are part of it and not looked for again
-        curves   laws that were learned, by name: they may be present, or asked for
-        """
-        from vaneloop.identification.user_models.bound_system import Bound
-
-        return Bound(self, records, like, values, present, curves)
