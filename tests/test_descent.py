@@ -5,8 +5,9 @@ A model here is y = b(size) u: what the steps do is what Gauss and Newton do to 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
@@ -193,12 +194,11 @@ def test_nothing_that_is_known_is_no_slope() -> None:
 
 
 @pytest.mark.parametrize(("fits", "share"), [(0, 0.0), (20, 0.25), (60, 0.5), (180, 0.75)])
-def test_half_of_a_stage_is_done_after_sixty_fits(monkeypatch: pytest.MonkeyPatch, fits: int, share: float) -> None:
-    stages = [SimpleNamespace(name=n, effects=("a", "b"), outputs=("y",)) for n in "pq"]
-    monkeypatch.setattr(workflow, "_WORK", stages)
-    monkeypatch.setattr(workflow, "_FITS", [SimpleNamespace(value=fits), SimpleNamespace(value=0)])
-    assert workflow._how_far(set())[0] == pytest.approx(share / 2.0)
-    done, said = workflow._how_far({1})
+def test_half_of_a_stage_is_done_after_sixty_fits(fits: int, share: float) -> None:
+    work = workflow._Work([SimpleNamespace(name=n, effects=("a", "b"), outputs=("y",)) for n in "pq"])  # type: ignore[misc]
+    work.fits[0].value = fits
+    assert workflow._how_far(work, set())[0] == pytest.approx(share / 2.0)
+    done, said = workflow._how_far(work, {1})
     assert done == pytest.approx(share / 2.0 + 0.5)
     assert said == "1 of 2 stages searched" + (f"; trying p (2 effects, {fits} fits)" if fits else "")
 
@@ -216,26 +216,20 @@ def test_stages_ten_times_smaller_than_the_largest_are_searched_first() -> None:
 def test_searches_in_other_processes_are_looked_at_ten_times_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
     waits: list[float | None] = []
 
-    class Pool:
-        def __init__(self, *_: object, **__: object):
-            pass
-
-        def __enter__(self) -> Pool:
-            return self
-
-        def __exit__(self, *_: object) -> None:
-            pass
-
-        def submit(self, _: object, i: int) -> Future[Any]:
+    @contextmanager
+    def in_processes(*_: object) -> Iterator[Any]:
+        def submit(i: int) -> Future[Any]:
             done: Future[Any] = Future()
             done.set_result((SimpleNamespace(stage=str(i), verdict="none", effects=[]), []))
             return done
+
+        yield submit
 
     def wait(jobs: Any, seconds: float | None, _: str) -> Any:
         waits.append(seconds)
         return (set() if len(waits) == 1 else set(jobs)), set()
 
-    monkeypatch.setattr(workflow, "ProcessPoolExecutor", Pool)
+    monkeypatch.setattr(workflow, "in_processes", in_processes)
     monkeypatch.setattr(workflow, "wait", wait)
     for name in ("_agree", "weigh"):
         monkeypatch.setattr(workflow, name, lambda *_: None)

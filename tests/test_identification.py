@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from threading import Barrier
 
 import numpy as np
 import pytest
@@ -699,3 +701,18 @@ def test_what_is_searched_at_once_comes_first_and_then_the_longest() -> None:
     assert names == ["short", "quick", "long", "middle", "tenth"]
     names = [list(sizes)[i] for i in _order(stages, True)]  # type: ignore[arg-type]
     assert names == ["long", "short", "quick", "middle", "tenth"]
+
+
+def test_threads_that_search_at_once_get_their_own_answers() -> None:
+    sizes = [(name, factor * TRUTH[name][0]) for name in ("null_bias", "dead_band") for factor in (0.5, 1.0, 1.5, 2.0)]
+    begin = Barrier(len(sizes))
+
+    def sought(k: int) -> list[list[str]]:
+        name, size = sizes[k]
+        gauge = gauges([linear("lean", (1.0, 0.5, 0.0), V)], [0.01 * k], seed=k)
+        begin.wait()
+        return [[f.effect for f in d.effects] for d in diagnose([integrator(k, **{name: size}), gauge]).stages]
+
+    with ThreadPoolExecutor(len(sizes)) as pool:
+        answers = list(pool.map(sought, range(len(sizes))))
+    assert answers == [[[name], ["lean"] if k else []] for k, (name, _) in enumerate(sizes)]

@@ -388,12 +388,12 @@ def test_the_shape_of_what_is_left_is_told_a_tenth_above_the_floor(
     monkeypatch: pytest.MonkeyPatch, times: float, beyond: bool
 ) -> None:
     said = SimpleNamespace(verdict="missing", excess=1.0 + 0.1 * times, floor=np.ones(1), final=None)
-    monkeypatch.setattr(workflow, "_WORK", [SimpleNamespace()])
+    work = workflow._Work([SimpleNamespace()])  # type: ignore[list-item]
     monkeypatch.setattr(workflow, "diagnose_stage", lambda *_, **__: said)
     monkeypatch.setattr(workflow, "floor_of", lambda *_: np.ones(1))
     monkeypatch.setattr(workflow, "Judge", lambda *_: None)
     monkeypatch.setattr(workflow, "shape", lambda *_: ["a shape"])
-    assert workflow._one(0) == (said, ["a shape"] if beyond else [])
+    assert workflow._one(work, 0) == (said, ["a shape"] if beyond else [])
 
 
 def test_the_limits_of_work_done_at_one_time_change_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -306,9 +306,9 @@ def test_a_log_is_held_stretch_by_stretch_and_what_fails_told_by_its_time(monkey
     pieces = 2 * long.STRETCH + 3
     asked: list[int] = []
 
-    def stretch(k: int) -> list[Sums]:
+    def stretch(work: long.Work, k: int) -> list[Sums]:
         asked.append(k)
-        (whole, chain, fits), *_ = long._WORK
+        whole, chain, fits = work
         assert whole.pieces == pieces and chain is held_chain and list(fits) == ["a", "b"]
         assert fits["a"][0].tolist() == [[1.0], [2.0]] and fits["a"][1].tolist() == [0.5]
         here = long.STRETCH if k < 2 else 4
@@ -325,7 +325,7 @@ def test_a_log_is_held_stretch_by_stretch_and_what_fails_told_by_its_time(monkey
     told: list[float] = []
     fits = [(n, [np.array([1.0]), np.array([2.0])], np.array([0.5]), 1.0) for n in ("a", "b")]
     held = long.held_against(held_chain, fits, workers=1, progress=told.append)
-    assert asked == [0, 1, 2] and told == pytest.approx([1 / 3, 2 / 3, 1.0]) and long._WORK == []
+    assert asked == [0, 1, 2] and told == pytest.approx([1 / 3, 2 / 3, 1.0])
     assert [(f.stage, f.signal, f.unit, f.low, f.high) for f in held.failing] == [
         ("a", "y", "mm", 170.0, 290.0), ("a", "y", "mm", 470.0, 530.0), ("a", "y", "mm", 2030.0, 2090.0),
     ]  # fmt: skip
@@ -351,14 +351,13 @@ def test_a_stretch_is_simulated_with_what_leads_to_it(monkeypatch: pytest.Monkey
     monkeypatch.setattr(long, "sums_of", lambda *a: made.append(a) or "sums")
     chain: Any = SimpleNamespace(stage=lambda name: stage(name, ("y", "z")))
     thetas = np.array([[7.0, 5.0, 2.0]])
-    long._WORK[:] = [(replace(whole, bind=bind), chain, {"a": (thetas, np.array([0.25, 0.75]))})]
-    assert long._stretch(1) == ["sums"]
+    work = long.Work(replace(whole, bind=bind), chain, {"a": (thetas, np.array([0.25, 0.75]))})
+    assert long._stretch(work, 1) == ["sums"]
     assert asked == [([(9600 - 300, 12_000)], 1)]
     of, floor, moved, first, behind, block = made[0]
     assert of.name == "a" and floor.tolist() == [0.75] == of.floor.tolist() and moved.tolist() == [[7.0, 5.0, 2.0]]
     assert (first, behind, block) == (96, 120, 100)
-    assert long._stretch(0) == [] and asked[1][0] == [(0, 9600)]
-    long._WORK.clear()
+    assert long._stretch(work, 0) == [] and asked[1][0] == [(0, 9600)]
 
 
 def test_a_search_goes_on_once_where_the_whole_log_fails(monkeypatch: pytest.MonkeyPatch) -> None:

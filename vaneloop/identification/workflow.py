@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from vaneloop.base.side_by_side import forks, in_processes
 from vaneloop.identification.least_squares.problem import Fit, Judge, recalibrate
 from vaneloop.identification.regimes import Located, Shape, StageFigures, agrees, locate, shape
 from vaneloop.identification.results import StageDiagnosis, parameters_of, recalibrated, rms_per_output, weigh
@@ -78,20 +78,28 @@ OFTEN = 0.1  # s between two looks at searches in other processes
 SHORT = 10  # times smaller than the longest search: takes next to nothing
 USUAL = 60.0  # fits after which half of a stage's search is usually done
 
-_WORK: list[Stage] = []
-_FITS: list[Any] = []  # of the work: a number that all processes see, fits made by each stage
-_JUDGED: list[Judged] = [NoiseFloor]  # of the work
+
+class _Work:
+    """The stages of one search.
+
+    judged  what an effect must do to be named
+    fits    fits made by each stage, numbers that all processes of the search see
+    """
+
+    def __init__(self, stages: Sequence[Stage], judged: Judged = NoiseFloor):
+        self.stages, self.judged = list(stages), judged
+        self.fits: list[Any] = [multiprocessing.RawValue("l", 0) for _ in self.stages]
 
 
-def _one(i: int, tell: Callable[[], None] | None = None) -> tuple[StageDiagnosis, list[Shape]]:
-    stage = _WORK[i]
+def _one(work: _Work, i: int, tell: Callable[[], None] | None = None) -> tuple[StageDiagnosis, list[Shape]]:
+    stage = work.stages[i]
 
     def tick() -> None:
-        _FITS[i].value += 1  # one process writes each
+        work.fits[i].value += 1  # one process writes each
         if tell:
             tell()
 
-    d = as_compared(stage, diagnose_stage(stage, floor_of(stage), tick=tick, judged=_JUDGED[0]))
+    d = as_compared(stage, diagnose_stage(stage, floor_of(stage), tick=tick, judged=work.judged))
     if d.verdict == "none" and d.criterion == "noise_floor":
         d = _under_every_condition(stage, d)
     return d, shape(Judge(stage, d.floor), d.final) if _leaves(d) else []
@@ -140,22 +148,21 @@ def diagnose(
     news      takes that too, with what is being tried and what each stage says as soon as it is searched
     """
     started = time.perf_counter()
-    _WORK[:], _JUDGED[:] = list(stages), [judged]
-    _FITS[:] = [multiprocessing.RawValue("l", 0) for _ in _WORK]
-    side_by_side = workers > 1 and len(_WORK) > 1 and hasattr(os, "fork")
-    order = _order(_WORK, side_by_side)
+    work = _Work(stages, judged)
+    side_by_side = forks(workers, len(work.stages))
+    order = _order(work.stages, side_by_side)
     done: dict[int, tuple[StageDiagnosis, list[Shape]]] = {}
 
     def tell(found: StageDiagnosis | None = None) -> None:
-        told = News(*_how_far(set(done)), found)
+        told = News(*_how_far(work, set(done)), found)
         if progress:
             progress(told.fraction)
         if news:
             news(told)
 
     if side_by_side:
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("fork")) as pool:
-            open_jobs = {pool.submit(_one, i): i for i in order}
+        with in_processes(_one, work, workers) as submit:
+            open_jobs = {submit(i): i for i in order}
             while open_jobs:
                 ended, _ = wait(open_jobs, OFTEN if news or progress else None, FIRST_COMPLETED)
                 for job in ended:
@@ -166,13 +173,13 @@ def diagnose(
                     tell()
     else:
         for i in order:
-            done[i] = _one(i, tell)
+            done[i] = _one(work, i, tell)
             tell(done[i][0])
-    results = [done[i][0] for i in range(len(_WORK))]
+    results = [done[i][0] for i in range(len(work.stages))]
     _agree({s.name: s for s in stages}, results)
     for d in results:
         weigh(d)
-    shapes = {done[i][0].stage: done[i][1] for i in range(len(_WORK)) if done[i][1]}
+    shapes = {done[i][0].stage: done[i][1] for i in range(len(work.stages)) if done[i][1]}
     return Diagnosis(verdict_of(results), results, shapes, dict(not_observed or {}), time.perf_counter() - started)
 
 
@@ -193,17 +200,17 @@ def _order(stages: Sequence[Stage], side_by_side: bool) -> list[int]:
     return sorted(out, key=lambda i: i != by_size[-1]) if side_by_side else out
 
 
-def _how_far(done: set[int]) -> tuple[float, str]:
+def _how_far(work: _Work, done: set[int]) -> tuple[float, str]:
     """Fraction of the search that is done, and what is being tried: nobody knows how many fits there will be."""
-    size = [max(1, len(s.effects)) * len(s.outputs) for s in _WORK]
-    fits = [n.value for n in _FITS]
-    share = [1.0 if i in done else fits[i] / (fits[i] + USUAL) for i in range(len(_WORK))]
+    size = [max(1, len(s.effects)) * len(s.outputs) for s in work.stages]
+    fits = [n.value for n in work.fits]
+    share = [1.0 if i in done else fits[i] / (fits[i] + USUAL) for i in range(len(work.stages))]
     at_work = [
-        f"{_WORK[i].name} ({len(_WORK[i].effects)} effects, {fits[i]} fits)"
-        for i in range(len(_WORK))
+        f"{stage.name} ({len(stage.effects)} effects, {fits[i]} fits)"
+        for i, stage in enumerate(work.stages)
         if i not in done and fits[i]
     ]
-    text = f"{len(done)} of {len(_WORK)} stages searched" + (f"; trying {', '.join(at_work)}" if at_work else "")
+    text = f"{len(done)} of {len(work.stages)} stages searched" + (f"; trying {', '.join(at_work)}" if at_work else "")
     return sum(a * b for a, b in zip(share, size, strict=True)) / sum(size), text
 
 

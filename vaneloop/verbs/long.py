@@ -5,17 +5,15 @@ of the log, stretch by stretch.
 from __future__ import annotations
 
 import gc
-import multiprocessing
-import os
 import time
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from vaneloop.base.side_by_side import forks, in_processes
 from vaneloop.identification.chunked_residuals import BLOCKS, Failing, Sums, failing, joined, of_whole, sums_of
 from vaneloop.identification.least_squares.problem import Judge
 from vaneloop.identification.regimes import Located
@@ -186,7 +184,12 @@ class Held:
         return [f for f in self.failing if f.stage == stage]
 
 
-_WORK: list[tuple[Whole, Chain, dict[str, tuple[Array, Array]]]] = []
+class Work(NamedTuple):
+    """What a stretch of a log is held against: its subsystems, the parameters to try and noise floors."""
+
+    whole: Whole
+    chain: Chain
+    fits: dict[str, tuple[Array, Array]]
 
 
 def held_against(
@@ -202,7 +205,7 @@ def held_against(
           fitted, in squared noise floors
     """
     whole = chain.whole
-    _WORK[:] = [(whole, chain, {name: (np.array(thetas), floor) for name, thetas, floor, _ in fits})]
+    work = Work(whole, chain, {name: (np.array(thetas), floor) for name, thetas, floor, _ in fits})
     pieces = -(-whole.grid.rows // whole.rows)  # the last one may be short
     many = -(-pieces // STRETCH)
     parts: dict[str, list[Sums]] = {}
@@ -213,14 +216,13 @@ def held_against(
         if progress:
             progress((k + 1) / many)
 
-    if workers > 1 and many > 1 and hasattr(os, "fork"):
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("fork")) as pool:
-            for k, found in enumerate(pool.map(_stretch, range(many))):
-                take(k, found)
+    if forks(workers, many):
+        with in_processes(_stretch, work, workers) as submit:
+            for k, job in enumerate([submit(k) for k in range(many)]):
+                take(k, job.result())
     else:
         for k in range(many):
-            take(k, _stretch(k))
-    _WORK.clear()
+            take(k, _stretch(work, k))
     sums = {name: joined(found) for name, found in parts.items()}
     looks = sum(len(s.outputs) * pieces for s in sums.values())
     out: list[Failing] = []
@@ -250,12 +252,12 @@ def _times(whole: Whole, sums: Sums, hot: Array, ratio: Array) -> list[Failing]:
     return out
 
 
-def _stretch(k: int) -> list[Sums]:
+def _stretch(work: Work, k: int) -> list[Sums]:
     """Sums of one stretch of the log at work."""
     from hil.logs import LogError
     from vaneloop.verbs.parts import carried
 
-    whole, chain, fits = _WORK[0]
+    whole, chain, fits = work
     rows, block = whole.rows, whole.rows // BLOCKS
     first, behind = k * STRETCH * rows, min((k + 1) * STRETCH * rows, whole.grid.rows)
     lead = whole.grid.window * round(LEAD)
