@@ -19,23 +19,25 @@ from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
 from vaneloop.identification.least_squares import problem as fitting
-from vaneloop.identification.least_squares.problem import DIFFERENCE, Fit, Judge
+from vaneloop.identification.least_squares.problem import DIFFERENCE, Fit, LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import diagnose_stage
 from vaneloop.identification.selection.search import Search
 from vaneloop.identification.subsystem import Stage
 
 __all__ = ["in_scipy", "ours"]
 
-Job = tuple[Judge, tuple[str, ...], np.ndarray, int]
+Job = tuple[LeastSquaresProblem, tuple[str, ...], np.ndarray, int]
 
 
 @contextmanager
 def _recorded() -> Iterator[list[Any]]:
     """Every fit and every screening that is made inside, in a list."""
     jobs: list[Any] = []
-    fit, screen = fitting.Judge.fitting, Search._screen
+    fit, screen = fitting.LeastSquaresProblem.fitting, Search._screen
 
-    def note_fit(self: Judge, effects: tuple[str, ...], start: Any, iterations: int = 12, weights: Any = None) -> Any:
+    def note_fit(
+        self: LeastSquaresProblem, effects: tuple[str, ...], start: Any, iterations: int = 12, weights: Any = None
+    ) -> Any:
         jobs.append((self, effects, np.array(start.theta if isinstance(start, Fit) else start), iterations))
         return fit(self, effects, start, iterations, weights)
 
@@ -43,11 +45,11 @@ def _recorded() -> Iterator[list[Any]]:
         jobs.append(self)
         return screen(self)
 
-    fitting.Judge.fitting, Search._screen = note_fit, note_screen  # type: ignore[method-assign]
+    fitting.LeastSquaresProblem.fitting, Search._screen = note_fit, note_screen  # type: ignore[method-assign]
     try:
         yield jobs
     finally:
-        fitting.Judge.fitting, Search._screen = fit, screen  # type: ignore[method-assign]
+        fitting.LeastSquaresProblem.fitting, Search._screen = fit, screen  # type: ignore[method-assign]
 
 
 def ours(stage: Stage) -> tuple[float, float, list[Any], list[float]]:
@@ -86,7 +88,11 @@ def in_scipy(stage: Stage, jobs: list[Any]) -> tuple[float, float, int, list[flo
         pull = np.array([np.sqrt(3.0) / tolerance[c] if c < len(stage.parameters) else 0.0 for c in free])
 
         def residuals(
-            z: np.ndarray, judge: Judge = judge, start: np.ndarray = start, free: Any = free, pull: Any = pull
+            z: np.ndarray,
+            judge: LeastSquaresProblem = judge,
+            start: np.ndarray = start,
+            free: Any = free,
+            pull: Any = pull,
         ) -> np.ndarray:
             theta = start.copy()
             theta[free] = z

@@ -113,7 +113,7 @@ def side_by_side() -> Iterator[Row]:
     from hil.logs import read_log
     from plant import build_plant
     from plant.stages import actuator, bends, engine, linkage
-    from vaneloop.identification.vane_chain.candidates import VaneGround
+    from vaneloop.identification.vane_chain.candidates import VaneChainCandidates
     from vaneloop.identification.vane_chain.chain import build_chain
 
     with tempfile.TemporaryDirectory() as folder:
@@ -121,7 +121,7 @@ def side_by_side() -> Iterator[Row]:
     chain = build_chain(log, build_plant())
     none = lambda p: np.zeros(p.shape[1], dtype=bool)  # noqa: E731
     for name in ("linkage", "actuator", "engine"):
-        ground = VaneGround(chain.stage(name))
+        ground = VaneChainCandidates(chain.stage(name))
         c = ground.candidates(ground.stage((), ()).neutral())[0]
         stage = ground.stage((), ((c.placed(), c.effect(1.0)),))
         sets = np.repeat(stage.neutral()[None], 16, axis=0)

@@ -13,9 +13,9 @@ import pytest
 from hil.logs import Channel, Log
 from tests import rig
 from tests.firmware_on_rig import firmware
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import StageDiagnosis
-from vaneloop.identification.selection.likelihood_acceptance import NoiseFloor
+from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
 from vaneloop.identification.selection.search import Search
 from vaneloop.identification.vane_chain.chain import build_chain
 from vaneloop.identification.workflow import diagnose
@@ -59,8 +59,10 @@ def test_a_sharp_limit_is_found_wherever_it_lies_below_the_speeds_of_the_log() -
         theta = stage.neutral()
         theta[stage.index()["valve_flow_saturation"]] = limit, 0.0
         limited = stage.run(theta[None])[0] + noise
-        judge = Judge(replace(stage, measured=np.where(np.isfinite(stage.measured), limited, np.nan)), stage.floor)
-        fit = Search(NoiseFloor(judge)).single("valve_flow_saturation")
+        judge = LeastSquaresProblem(
+            replace(stage, measured=np.where(np.isfinite(stage.measured), limited, np.nan)), stage.floor
+        )
+        fit = Search(LikelihoodAcceptance(judge)).single("valve_flow_saturation")
         assert fit.theta[stage.index()["valve_flow_saturation"]][0] == pytest.approx(limit, rel=0.01), limit
 
 

@@ -18,7 +18,7 @@ from tests.test_search_limits import SIDES, fit_of, judge_of
 from vaneloop.identification import workflow
 from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known
 from vaneloop.identification.least_squares.levenberg_marquardt import carries
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection import diagnosis as diagnose
 from vaneloop.identification.subsystem import Effect, Parameter, Stage
 
@@ -40,7 +40,7 @@ class Asked(list[Array]):
 
 def judge_with(
     model: Callable[[Array], Array], size: float, rest: float = 0.0, columns: int = 1, carry: bool = False
-) -> tuple[Judge, Asked]:
+) -> tuple[LeastSquaresProblem, Asked]:
     """A stage whose first parameter leaves an error ``size`` (1 - model), root of the sum of squares; each of the other
     ``columns`` has a slope of its own and no error. ``rest``: the sum of squares beyond noise that no parameter takes
     off.
@@ -60,7 +60,7 @@ def judge_with(
     parameters = tuple(Parameter(f"p{k}", 0.0, "1", -1e3, 1e3, scale=1.0) for k in range(columns))
     effect = Effect("e", parameters, (tuple(1.0 for _ in parameters),))
     stage = Stage("s", ("y",), ("1",), (), (effect,), run, 0.1 * np.arange(N), measured[None], carries=carry)
-    judge = Judge(stage, np.ones(1))
+    judge = LeastSquaresProblem(stage, np.ones(1))
     assert judge.n == N
     return judge, asked
 

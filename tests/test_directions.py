@@ -8,7 +8,7 @@ import pytest
 from hil.logs import Channel, Log
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import diagnose_stage
 from vaneloop.identification.subsystem import Effect, Parameter, Stage
 from vaneloop.identification.vane_chain.chain import build_chain
@@ -77,7 +77,7 @@ def test_an_interval_may_cross_the_cut():
 
 
 def test_a_direction_has_no_bound():
-    judge = Judge(ring_stage(0.0), np.array([NOISE]))
+    judge = LeastSquaresProblem(ring_stage(0.0), np.array([NOISE]))
     low, high = judge.bounds()
     assert (low[2], high[2]) == (-np.inf, np.inf)
     start = np.array([0.0, 0.6, 170.0, 0.0, 0.0])

@@ -16,7 +16,7 @@ from tests.test_identification import FLOOR, integrator
 from tests.test_your_own_model import STRAIGHT, T, cascade, noise, tanks, wave
 from vaneloop import Parameter, Record, System, unknown
 from vaneloop.identification import Stage
-from vaneloop.identification.selection.relative_error_acceptance import ErrorShare
+from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance
 from vaneloop.identification.workflow import compare_stages, diagnose
 from vaneloop.verbs.search import Diagnosed, Stages
 
@@ -197,4 +197,4 @@ def test_a_stage_begins_where_its_fit_may_begin_whoever_asks() -> None:
     )  # fmt: skip
     (figures,) = compare_stages([stage])
     assert figures.rms < 0.011
-    assert diagnose([stage], judged=ErrorShare).stages[0].error_before.tolist() == [figures.rms]
+    assert diagnose([stage], judged=RelativeErrorAcceptance).stages[0].error_before.tolist() == [figures.rms]

@@ -22,8 +22,8 @@ from plant.parameters import LVDT_FACTOR
 from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
 from vaneloop.base.forms import FORMS
-from vaneloop.identification.least_squares.problem import Judge, recalibrate
-from vaneloop.identification.least_squares.residuals import FAR, whiten
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
+from vaneloop.identification.least_squares.residuals import FAR, normalise_residuals
 from vaneloop.identification.subsystem import Parameter, Stage, StageError
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
 from vaneloop.identification.vane_chain.parameters import FREE
@@ -65,20 +65,22 @@ def fake(model: float) -> Stage:
 def test_what_a_model_does_not_say_is_far_off_and_what_was_not_measured_counts_nothing(value: float) -> None:
     model = np.array([[[0.5, value, value]]])
     out = np.empty_like(model)
-    whiten(model, np.zeros((1, 3)), np.array([[1.0, 1.0, 0.0]]), np.array([0.1]), np.empty(0, np.int64), out)
+    normalise_residuals(
+        model, np.zeros((1, 3)), np.array([[1.0, 1.0, 0.0]]), np.array([0.1]), np.empty(0, np.int64), out
+    )
     assert out.tolist() == [[[-5.0, FAR, 0.0]]]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_stage_that_gives_no_number_as_it_was_given_is_refused_in_one_line(value: float) -> None:
     with pytest.raises(StageError, match=r"^stage 'servo': the model's i_cmd is no number at 0.07 s and in 1 samples"):
-        recalibrate(Judge(fake(value), np.array([0.1])))
+        recalibrate(LeastSquaresProblem(fake(value), np.array([0.1])))
 
 
 def test_a_sample_that_was_not_measured_asks_nothing_of_the_model() -> None:
     stage = fake(0.0)
     stage.measured[0, 7] = np.nan
-    recalibrate(Judge(stage, np.array([0.1])))
+    recalibrate(LeastSquaresProblem(stage, np.array([0.1])))
 
 
 @pytest.mark.parametrize(
@@ -120,7 +122,7 @@ def test_a_recalibrated_model_may_go_where_the_table_allows_and_no_farther(table
 @pytest.mark.parametrize("table", TABLES)
 def test_every_stage_gives_numbers_to_the_ends_of_every_tolerance_and_of_every_effect(table: str) -> None:
     for stage in chain(table).stages:
-        low, high = Judge(stage, np.ones(len(stage.outputs))).bounds()
+        low, high = LeastSquaresProblem(stage, np.ones(len(stage.outputs))).bounds()
         low, high = np.maximum(low, -1e9), np.minimum(high, 1e9)
         own, index = len(stage.parameters), stage.index()
         thetas = [stage.neutral() for _ in range(2 * own)]

@@ -205,7 +205,7 @@ def test_every_option_that_writes_a_file_is_tried() -> None:
     }
 
 
-class Tried:
+class FittedCandidate:
     """A run of a command in which each file is first written on a full disk, by children that are forked there."""
 
     def __init__(self, folder: Path, names: set[str]):
@@ -278,7 +278,7 @@ def test_every_file_of_a_command_is_the_old_one_where_the_disk_is_full(
         case.before(tmp_path, monkeypatch)
     old = held(tmp_path)
     monkeypatch.chdir(tmp_path)
-    tried = Tried(tmp_path, names)
+    tried = FittedCandidate(tmp_path, names)
     monkeypatch.setattr(files, "_begin", tried.begin)
     words = [w for w in case.writes.split() if w not in TABLES.split()]
     more = ["--out", "run"] if name == "campaign" else []

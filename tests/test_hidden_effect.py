@@ -22,7 +22,7 @@ from vaneloop.base.tables import path
 from vaneloop.cli.hidden_effect import _named_where, _sizes, _too_easy, draw_case, judge_case, learned_right
 from vaneloop.cli.main import main
 from vaneloop.cli.same_curve import like_it, with_effect
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.vane_chain.chain import build_chain
 
 N = 200
@@ -170,7 +170,7 @@ def test_a_curve_is_what_is_hidden_where_the_stage_gives_the_same(name):
     chain = build_chain(Log("rig", {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"}))
     stage = chain.stage(PLACES[named.rpartition(" ")[0]].stages[0])
     own, aim = with_effect(stage, name, _sizes(hidden))
-    judge = Judge(stage, stage.floor)
+    judge = LeastSquaresProblem(stage, stage.floor)
     assert np.sqrt(np.sum(judge._whiten(aim[None]) ** 2) / judge.n) < 1.05  # the library's effect is what the rig hides
     nearest = {}
     for told in filter(None, (named, also, wrong)):

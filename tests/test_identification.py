@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from vaneloop.base.terminal import plain
 from vaneloop.identification import Effect, Parameter, Stage, StageError
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.regimes import locate, onset, regimes, shape, step_in
 from vaneloop.identification.results import Found, StageDiagnosis
 from vaneloop.identification.selection.diagnosis import diagnose_stage, extend_stage
@@ -204,7 +204,7 @@ def test_ninety_per_cent_intervals_hold_the_truth_about_nine_times_in_ten() -> N
         stage = integrator(100 + seed, null_bias=0.1)
         start = stage.neutral()
         start[1] = 0.05
-        fit = Judge(stage, FLOOR).fit(("null_bias",), start)
+        fit = LeastSquaresProblem(stage, FLOOR).fit(("null_bias",), start)
         k = int(np.flatnonzero(fit.free == 1)[0])
         hits.append(fit.low[k] <= 0.1 <= fit.high[k])
     assert sum(hits) >= 14  # fewer than 14 of 20 happen once in 400 when the share is 0.9
@@ -228,7 +228,7 @@ def test_two_effects_that_gain_little_alone_are_found_as_a_pair() -> None:
     # what is seen is 0.25 v; alone neither u nor 0.25 v - u looks like it
     first, second = linear("first", (1, 1, 1), U), linear("second", (1, 1, 1), 0.25 * V - U)
     stage = gauges([linear("decoy", (1, 0, 0), W), first, second], [0.0, 1.0, 1.0])
-    judge = Judge(stage, GAUGE_FLOOR)
+    judge = LeastSquaresProblem(stage, GAUGE_FLOOR)
     base = judge.fit((), stage.neutral()).held_out.sum()
     for name in ("first", "second"):
         assert judge.fit((name,), stage.neutral()).held_out.sum() > 0.8 * base
@@ -282,7 +282,7 @@ def test_parameters_stay_within_their_bounds() -> None:
     d = extend_stage(integrator(null_bias=7.0), ("null_bias",))
     assert d.effects[0].parameters["bias"]["value"] == pytest.approx(5.0, abs=0.2)
     assert np.all(d.final.theta[1] <= 5.0)
-    far = Judge(integrator(gain=3.8), FLOOR).fit((), integrator().neutral())
+    far = LeastSquaresProblem(integrator(gain=3.8), FLOOR).fit((), integrator().neutral())
     assert far.theta[0] == pytest.approx(3.15)  # nominal 3.0, tolerance 0.15
 
 
@@ -296,7 +296,7 @@ def test_a_parameter_beyond_its_tolerance_is_not_nothing() -> None:
 def unknown(stage: Stage) -> str:
     d = search(stage)
     assert (d.verdict, d.effects) == ("unknown", [])
-    return shape(Judge(stage, d.floor), d.final)[0].text
+    return shape(LeastSquaresProblem(stage, d.floor), d.final)[0].text
 
 
 def test_a_speed_that_depends_on_a_condition_is_unknown_and_the_condition_is_named() -> None:
@@ -314,7 +314,7 @@ def test_an_oscillation_is_unknown_and_its_frequency_and_amplitude_are_named() -
     stage = integrator(added=0.05 * np.sin(2 * np.pi * 7.3 * T))
     d = search(stage)
     assert d.verdict == "unknown"
-    (s,) = shape(Judge(stage, d.floor), d.final)
+    (s,) = shape(LeastSquaresProblem(stage, d.floor), d.final)
     assert s.feature == "frequency" and "oscillates at 7.30 Hz" in s.text
     assert float(s.text.split("amplitude of ")[1].split()[0]) == pytest.approx(0.05, rel=0.1)
 
@@ -324,7 +324,7 @@ def test_a_static_error_is_described_by_the_error_itself() -> None:
     stage.measured[1] += 0.2 * V**2
     d = search(stage)
     assert d.verdict == "unknown"
-    first = shape(Judge(stage, d.floor), d.final)[0]
+    first = shape(LeastSquaresProblem(stage, d.floor), d.final)[0]
     assert (first.output, first.feature) == ("b", "v")
     assert "error of b grows with the square of v" in first.text
 
@@ -334,7 +334,7 @@ def test_a_static_error_is_described_by_the_error_itself() -> None:
 
 def test_the_onset_is_found_within_seconds() -> None:
     stage = integrator(1, added=np.cumsum(np.where(T > 62.0, 0.6, 0.0)) * DT)
-    judge = Judge(stage, FLOOR)
+    judge = LeastSquaresProblem(stage, FLOOR)
     start = onset(judge, judge.fit((), stage.neutral()))
     assert start is not None and abs(start - 62.0) <= 4.0
 
@@ -350,14 +350,14 @@ def test_a_step_is_where_ruptures_finds_it(n: int, at: float, size: float, seed:
 @pytest.mark.parametrize("hidden", [{}, {"null_bias": 0.4}])
 def test_what_is_always_or_never_there_has_no_onset(hidden: dict[str, float]) -> None:
     stage = integrator(1, **hidden)
-    judge = Judge(stage, FLOOR)
+    judge = LeastSquaresProblem(stage, FLOOR)
     assert onset(judge, judge.fit((), stage.neutral())) is None
 
 
 def test_the_map_of_conditions_points_to_the_bin_that_fails() -> None:
     rng = np.random.default_rng(9)
     stage = integrator(added=np.where((LOAD > 0.72) & (LOAD < 0.76), 0.03, 0.0) * rng.standard_normal(N))
-    judge = Judge(stage, FLOOR)
+    judge = LeastSquaresProblem(stage, FLOOR)
     found = regimes(judge, judge.fit((), stage.neutral()), 2.0)
     first = found[0]
     assert first.condition == "load" and first.condition_unit == "kN"
@@ -371,7 +371,7 @@ def test_the_map_of_conditions_points_to_the_bin_that_fails() -> None:
 
 def test_clean_data_fail_nowhere() -> None:
     for seed in range(4):
-        judge = Judge(integrator(seed), FLOOR)
+        judge = LeastSquaresProblem(integrator(seed), FLOOR)
         found = regimes(judge, judge.fit((), judge.stage.neutral()), 2.0)
         assert {r.condition for r in found} == {"time", "current", "direction", "load"}
         assert not any(r.significant.any() for r in found)
@@ -394,7 +394,7 @@ def test_what_the_whole_log_hides_is_unknown_where_one_condition_shows_it() -> N
 
 def test_one_stretch_of_the_log_is_no_condition() -> None:
     stage = uneven(np.abs(T - 33.0) < 1.0)
-    judge = Judge(stage, GAUGE_FLOOR)
+    judge = LeastSquaresProblem(stage, GAUGE_FLOOR)
     found = {r.condition: r for r in regimes(judge, judge.fit((), stage.neutral()), 2.0) if r.output == "a"}
     assert found["time"].ratio.max() > 1.1  # one bin has it, and no other of these samples says so
     assert not any(r.significant.any() for r in found.values())
@@ -417,7 +417,7 @@ def test_missing_samples_do_not_count() -> None:
     b = diagnose_stage(garbage, FLOOR, keep=~gone)
     assert names(a) == {"dead_band"} and holds(a.effects[0], "half_width", 0.6)
     assert np.array_equal(a.final.theta, b.final.theta) and a.error_after[0] == b.error_after[0]
-    assert Judge(holes, FLOOR).n == N - gone.sum() < Judge(clean, FLOOR).n
+    assert LeastSquaresProblem(holes, FLOOR).n == N - gone.sum() < LeastSquaresProblem(clean, FLOOR).n
     assert compare_stages([holes])[0].samples == N - gone.sum()
 
 
@@ -526,9 +526,9 @@ def test_locating_and_diagnosing_start_from_the_same_error() -> None:
 
 
 def test_a_stage_fails_where_one_condition_does_or_the_whole_is_more_than_noise() -> None:
-    clean = locate(Judge(integrator(1), FLOOR))
+    clean = locate(LeastSquaresProblem(integrator(1), FLOOR))
     assert not clean.fails and clean.verdict() == "fits everywhere" and clean.json()["fails"] is False
-    louder = locate(Judge(integrator(1), FLOOR / 1.2))
+    louder = locate(LeastSquaresProblem(integrator(1), FLOOR / 1.2))
     assert louder.fails and louder.worst.ratio == pytest.approx(1.2, rel=0.03)
     assert replace(louder, regimes=()).verdict().startswith("fails in no single condition more than in others: ")
 
@@ -608,7 +608,9 @@ def test_a_long_log_is_searched_on_an_excerpt_and_judged_whole(monkeypatch: pyte
     d = search(stage)
     assert seen and max(seen) < 0.4 * N
     assert d.verdict == "missing" and names(d) == {"tilt"} and holds(d.effects[0], "size", 0.05)
-    assert len(d.final.cost) == len(Judge(stage, GAUGE_FLOOR).block_start)  # the verdict's errors are the whole log's
+    assert len(d.final.cost) == len(
+        LeastSquaresProblem(stage, GAUGE_FLOOR).block_start
+    )  # the verdict's errors are the whole log's
 
 
 def test_an_effect_that_acts_in_one_stretch_of_a_long_log_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -636,7 +638,7 @@ def test_an_integrating_stage_is_cut_at_its_windows(monkeypatch: pytest.MonkeyPa
 
 
 def test_fits_made_together_are_those_made_one_by_one() -> None:
-    judge = Judge(integrator(7, null_bias=0.3), FLOOR)
+    judge = LeastSquaresProblem(integrator(7, null_bias=0.3), FLOOR)
     starts = {e.name: judge.stage.neutral() for e in LIBRARY}
     for e in LIBRARY:
         starts[e.name][judge.stage.index()[e.name]] = e.starts[0]
@@ -649,7 +651,7 @@ def test_fits_made_together_are_those_made_one_by_one() -> None:
 
 def test_a_fit_goes_on_from_a_fit_as_from_its_parameters_without_asking_for_errors_there_again() -> None:
     stage = integrator(7, null_bias=0.3)
-    judge, name, calls = Judge(stage, FLOOR), LIBRARY[0].name, []
+    judge, name, calls = LeastSquaresProblem(stage, FLOOR), LIBRARY[0].name, []
     begin = stage.neutral()
     begin[stage.index()[name]] = LIBRARY[0].starts[0]
     quick, errors = judge.fit((name,), begin, 1), judge.errors

@@ -21,7 +21,7 @@ def test_a_set_that_was_simulated_is_not_simulated_again(monkeypatch):
         return np.repeat(thetas[:, :1, None], 5, axis=2)
 
     monkeypatch.setattr(latest, "VALUES", 15)  # three sets
-    kept = latest.Latest()
+    kept = latest.ResidualCache()
 
     def errors(*sets: float) -> None:
         out = kept.errors(np.array(sets)[:, None], simulate)

@@ -31,12 +31,12 @@ from vaneloop.cli.blind import as_curve
 from vaneloop.identification import StageError
 from vaneloop.identification.candidates.closed_forms import begin, text_of
 from vaneloop.identification.candidates.spline_basis import basis_of
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.subsystem import Effect, Parameter, Stage
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas, goes_on
-from vaneloop.identification.unmodelled.curve_candidates import OwnGround, candidates, on_logs, with_curves
+from vaneloop.identification.unmodelled.curve_candidates import UserModelCandidates, candidates, on_logs, with_curves
 from vaneloop.identification.unmodelled.fitted_candidate import (
-    Tried,
+    FittedCandidate,
     held_out,
     left_by_its_mean,
     one_constant,
@@ -251,7 +251,7 @@ def test_a_constant_is_one_law_whatever_it_is_called_a_function_of() -> None:
     n, x = 600, np.linspace(-1.0, 1.0, 600)
     rows = np.stack([np.sin(9.0 * x), np.ones(n), x], axis=1)
 
-    def tried(at: str, mean: float, slope: float, of: str = "q") -> Tried:
+    def tried(at: str, mean: float, slope: float, of: str = "q") -> FittedCandidate:
         y = rows @ np.array([0.3, mean, slope]) + rng.standard_normal(n)
         theta = np.linalg.lstsq(rows, y, rcond=None)[0]
         e = y - rows @ theta
@@ -265,7 +265,7 @@ def test_a_constant_is_one_law_whatever_it_is_called_a_function_of() -> None:
         )  # fmt: skip
         quantity = SimpleNamespace(name=of, period=0.0, remembers="lagged" in of, less=None)
         c = SimpleNamespace(how="adds", at=at, name="c", kept=[0, 1], quantity=quantity, near=False)
-        one = cast(Tried, SimpleNamespace(candidate=c, fit=fit, judge=judge))
+        one = cast(FittedCandidate, SimpleNamespace(candidate=c, fit=fit, judge=judge))
         only = np.linalg.lstsq(rows[:, :2], y, rcond=None)[0]
         assert left_by_its_mean(one) == pytest.approx(np.sum((y - rows[:, :2] @ only) ** 2))
         held = np.array([theta[0], np.inf, np.inf])  # at its bound, the model's own parameter takes over nothing
@@ -295,10 +295,10 @@ def test_what_a_bound_stops_the_curve_takes_over(size: float, sign: float) -> No
     curve = Effect("curve", (Parameter("line", 0.0, "", scale=1.0, tolerance=100.0),), ((0.3,),))
     measured = np.array([1.02, 0.46, sign * size]) @ shapes + 0.01 * np.random.default_rng(0).standard_normal(len(t))
 
-    def judge(effects: tuple[Effect, ...]) -> Judge:
+    def judge(effects: tuple[Effect, ...]) -> LeastSquaresProblem:
         rows = shapes[: 2 + len(effects)]
         stage = Stage("s", ("y",), ("",), own, effects, lambda p: (p @ rows)[:, None], t, measured[None])
-        return Judge(stage, np.array([0.01]))
+        return LeastSquaresProblem(stage, np.array([0.01]))
 
     before = judge(())
     fit = before.fit((), before.stage.neutral())
@@ -450,7 +450,7 @@ def test_bad_input_gets_one_line(tmp_path: Path, words: tuple[str, ...], said: s
 def test_a_judge_of_a_curve_counts_its_amplitudes_as_effects(bound) -> None:
     c = candidates(bound, bound.stage.neutral()[:2])[0]
     w = with_curves(bound, (), [(c.placed(), c.effect(1.0))])
-    judge = Judge(w.thinned, bound.floor)
+    judge = LeastSquaresProblem(w.thinned, bound.floor)
     assert len(judge.columns((c.name,))) == len(judge.columns(())) + len(c.effect(1.0).parameters)
 
 
@@ -664,7 +664,7 @@ def test_a_shape_that_no_curve_has_is_refused(shape: list[str]) -> None:
 def test_a_test_log_speaks_of_a_curve_where_its_quantity_has_been() -> None:
     run = run_of_a_tank()
     further = replace(run, name="further", columns={**run.columns, "oil": run.columns["oil"] + 15.0})
-    ground = OwnGround(bind(TANK, [run], [further]))
+    ground = UserModelCandidates(bind(TANK, [run], [further]))
     every = ground.candidates(BoundSystem(TANK, [run]).stage.neutral()[:2])
     assert {c.quantity.name for c in every} >= {"oil", "pump", "level", "time", "direction_of_pump"}
     for c in every:
@@ -680,7 +680,7 @@ def test_a_test_log_speaks_of_a_curve_where_its_quantity_has_been() -> None:
 
 
 def test_a_formula_goes_on_while_it_is_not_much_steeper_than_where_logs_have_been() -> None:
-    ground = OwnGround(bind(TANK, [run_of_a_tank()]))
+    ground = UserModelCandidates(bind(TANK, [run_of_a_tank()]))
     c = next(c for c in ground.candidates(BoundSystem(TANK, [run_of_a_tank()]).stage.neutral()[:2]) if c.name == NAME)
     low, high = c.basis.low, c.basis.high
     span = high - low
@@ -861,14 +861,14 @@ def test_a_formula_of_a_full_sensor_is_fitted_beyond_what_the_sensor_shows() -> 
         "gauge", "static", gauge, inputs={"pressure": "bar"}, outputs={"reading": "V"},
         parameters=[unknown("gain", 1.0, "V/bar", low=0.0)],
     )  # fmt: skip
-    ground = OwnGround(bind(system, [Record("run", t, {"pressure": u, "reading": y})]))
-    judge = Judge(ground.stage((), ()), ground.floor)
+    ground = UserModelCandidates(bind(system, [Record("run", t, {"pressure": u, "reading": y})]))
+    judge = LeastSquaresProblem(ground.stage((), ()), ground.floor)
     base = judge.fit((), judge.stage.neutral(), 12)
     c = next(c for c in ground.candidates(base.theta) if c.name == "reading.curve_of_reading")
     curves = ((c.placed(), c.effect(1.0)),)
-    curved = Judge(ground.stage((), curves), ground.floor)
+    curved = LeastSquaresProblem(ground.stage((), curves), ground.floor)
     fit = curved.fit((c.name,), np.concatenate([base.theta, np.zeros(len(c.parts))]), 12)
-    best, _ = fitted_formulas(ground, Tried(c, 1.0, curved, fit, curves))[0]
+    best, _ = fitted_formulas(ground, FittedCandidate(c, 1.0, curved, fit, curves))[0]
     assert best.form == "above"
     assert best.numbers["a"] == pytest.approx(-1.0, abs=0.02)
     assert best.numbers["b"] == pytest.approx(5.0, abs=0.02)

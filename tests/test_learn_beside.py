@@ -10,7 +10,7 @@ import pytest
 from plant import Model
 from vaneloop import Record, System, unknown
 from vaneloop.base.tables import read
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.search import Search
 from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.by_log import bind
@@ -66,7 +66,7 @@ def test_a_size_that_changes_nothing_is_no_beginning() -> None:
     """A limit beyond all that was seen leaves as much as the model without it, and no fit leads on from there."""
     record = run_of_a_valve(1)
     logs = bind(VALVE, [record])
-    search = Search(logs.judged()(Judge(logs.fitted.thinned, logs.fitted.floor)))
+    search = Search(logs.judged()(LeastSquaresProblem(logs.fitted.thinned, logs.fitted.floor)))
     with_it = search.single("lever.dead_time")
     theta, rest = with_it.theta.copy(), frozenset(with_it.effects)
     at = search.stage.index()["lever.saturation"]

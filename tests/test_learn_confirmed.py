@@ -17,7 +17,7 @@ from vaneloop.identification.candidates.closed_forms import begin
 from vaneloop.identification.candidates.library import FORCE_LAWS
 from vaneloop.identification.unmodelled import confirmation as confirmed
 from vaneloop.identification.unmodelled.confirmation import OTHER, moves, stands_before
-from vaneloop.identification.unmodelled.learning import Learner
+from vaneloop.identification.unmodelled.learning import CurveSearch
 from vaneloop.identification.unmodelled.parametric_preference import earning_by_formula
 from vaneloop.identification.user_models.hysteresis_regressors import NO_TURN, swings
 
@@ -159,13 +159,13 @@ def test_a_friction_is_tried_with_its_jump_though_its_splines_leave_more_than_an
         pass
 
     finalists: list[Any] = []
-    found = Learner._finalists
+    found = CurveSearch._finalists
 
-    def first(self: Learner, current: Any) -> Any:
+    def first(self: CurveSearch, current: Any) -> Any:
         finalists.extend(found(self, current))
         raise Enough
 
-    monkeypatch.setattr(Learner, "_finalists", first)
+    monkeypatch.setattr(CurveSearch, "_finalists", first)
     t, rng = np.arange(0.0, 16.0, 0.01), np.random.default_rng(3)
     phases = zip((0.3, 0.7, 1.1, 1.7), rng.uniform(0.0, 6.0, 4), strict=True)
     x = np.sum([np.sin(2.0 * np.pi * f * t + phase) / f for f, phase in phases], axis=0)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from vaneloop import Record, System, unknown
-from vaneloop.identification.unmodelled.curve_candidates import Candidate, OwnGround
-from vaneloop.identification.unmodelled.fitted_candidate import Tried
-from vaneloop.identification.unmodelled.learning import SPLINES, TIMES, WIGGLES, Learner
+from vaneloop.identification.unmodelled.curve_candidates import Candidate, UserModelCandidates
+from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
+from vaneloop.identification.unmodelled.learning import SPLINES, TIMES, WIGGLES, CurveSearch
 from vaneloop.identification.unmodelled.screening import smoothed
 from vaneloop.identification.user_models.by_log import bind
 from vaneloop.identification.user_models.hysteresis_regressors import lagged, named_lag
@@ -24,7 +24,7 @@ SLIDE = System(
 Law = Callable[[np.ndarray], np.ndarray]
 
 
-def learner_of(law: Law, tau: float, seed: int, gain: float = 2.0) -> Learner:
+def learner_of(law: Law, tau: float, seed: int, gain: float = 2.0) -> CurveSearch:
     """A search on logs of a slide that adds a ``law`` of its drive behind a lag of ``tau`` (s)."""
     rng = np.random.default_rng(seed)
     records = []
@@ -33,17 +33,17 @@ def learner_of(law: Law, tau: float, seed: int, gain: float = 2.0) -> Learner:
         drive = np.interp(t, np.arange(0.0, 121.0, 5.0), rng.uniform(-5.0, 5.0, 25)) + np.sin(t / (2.0 + k))
         place = gain * drive + law(lagged(t, drive, tau)) + 0.01 * rng.standard_normal(len(t))
         records.append(Record(f"log {k}", t, {"drive": drive, "place": place}))
-    ground = OwnGround(bind(SLIDE, records, []))
+    ground = UserModelCandidates(bind(SLIDE, records, []))
     fit = SimpleNamespace(theta=ground.whole.neutral(), effects=())
     d: Any = SimpleNamespace(base=fit, final=fit, verdict="unknown", effects=[], nearest=[])
-    return Learner(ground, d)
+    return CurveSearch(ground, d)
 
 
-def late(learner: Learner) -> tuple[Tried, Candidate]:
+def late(learner: CurveSearch) -> tuple[FittedCandidate, Candidate]:
     """The model as it is, and what its place has of the drive behind the longest lag that is tried first."""
     known = [c for c in learner.candidates if c.how == "output adds" and c.quantity.name.startswith("drive_lagged_by")]
     last = max(known, key=tau_of)
-    return Tried(last, 0.0, learner.judge, learner.base, ()), last
+    return FittedCandidate(last, 0.0, learner.judge, learner.base, ()), last
 
 
 def tau_of(c: Candidate) -> float:

@@ -22,10 +22,10 @@ from vaneloop.base.tables import read
 from vaneloop.cli.same_law import same_by_equations
 from vaneloop.identification import StageError
 from vaneloop.identification.candidates.closed_forms import Formula
-from vaneloop.identification.unmodelled.curve_candidates import OwnGround, candidates, with_curves
+from vaneloop.identification.unmodelled.curve_candidates import UserModelCandidates, candidates, with_curves
 from vaneloop.identification.unmodelled.fitted_candidate import plain
 from vaneloop.identification.unmodelled.learned_law import LearnedLaw
-from vaneloop.identification.unmodelled.learning import Learner
+from vaneloop.identification.unmodelled.learning import CurveSearch
 from vaneloop.identification.unmodelled.python_law import python_law
 from vaneloop.identification.unmodelled.regressors import quantities
 from vaneloop.identification.user_models.bound_system import BoundSystem
@@ -301,7 +301,7 @@ def test_a_test_log_speaks_of_a_difference_that_would_be_none_by_itself() -> Non
     """In the test log the belt stands, so that less it a speed is the same quantity there."""
     further = run_of_a_drive(2, size=12.0)
     further = Record("further", further.t, {**further.columns, "belt": np.full(len(further.t), 1.0)})
-    ground = OwnGround(bind(DRIVE, [run_of_a_drive(1)], [further]))
+    ground = UserModelCandidates(bind(DRIVE, [run_of_a_drive(1)], [further]))
     assert ground.logs.test is not None and list(differences(ground.logs.test)) == [D]
     every = ground.candidates(ground.logs.fitted.stage.neutral()[:2])
     for of in (D, "motor_minus_belt"):
@@ -361,7 +361,7 @@ def test_where_a_formula_of_a_plainer_curve_goes_before_the_best_curve_all_have_
     )
     for plainer, expected in ((-0.5, {"a": -0.5, "a_minus_b": -2.0}), (0.2, {"a": 0.2, "a_minus_b": 0.0})):
         left = {"a": 0.3, "a_minus_b": 0.0}
-        Learner._with_formulas(learner, fitted("b", 9.0), [fitted("a", plainer), fitted("a_minus_b", -2.0)], left)
+        CurveSearch._with_formulas(learner, fitted("b", 9.0), [fitted("a", plainer), fitted("a_minus_b", -2.0)], left)
         assert left == expected
 
 

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from tests.test_learn_vanes import chain
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.likelihood_acceptance import NATS, RIVAL_NATS
 from vaneloop.identification.selection.relative_error_acceptance import PER_PARAMETER, RIVAL, score
 from vaneloop.identification.unmodelled.closed_form_fits import CLOSE, REFITTED, _nearest
 from vaneloop.identification.unmodelled.likelihood_acceptance import above_the_noise, earns, grain_of, unconfirmed
-from vaneloop.identification.vane_chain.candidates import VaneGround, remade
+from vaneloop.identification.vane_chain.candidates import VaneChainCandidates, remade
 
 N = 30_000
 
 
 def nominal(name: str = "linkage"):
     stage = remade(chain()[1].stage(name), (), ())
-    judge = Judge(stage, stage.floor)
+    judge = LeastSquaresProblem(stage, stage.floor)
     return judge, judge.fit((), stage.neutral())
 
 
@@ -59,10 +59,10 @@ def test_what_is_sure_and_too_little_is_no_law() -> None:
 
 
 def test_no_curve_is_larger_in_usual_than_what_moves_the_outputs_by_their_error() -> None:
-    ground = VaneGround(chain()[1].stage("actuator"))
+    ground = VaneChainCandidates(chain()[1].stage("actuator"))
     theta = ground.whole.neutral()[: len(ground.whole.parameters)]
     gain = next(c for c in ground.candidates(theta) if c.name == "actuator.flow_gain.gain_of_t_oil")
-    judge = Judge(ground.stage((), ((gain.placed(), gain.effect(1.0)),)), ground.floor)
+    judge = LeastSquaresProblem(ground.stage((), ((gain.placed(), gain.effect(1.0)),)), ground.floor)
     moved = np.repeat(judge.stage.neutral()[None], 2, axis=0)
     moved[1, len(theta)] = gain.size
     still, by = judge.errors(moved)
@@ -72,7 +72,7 @@ def test_no_curve_is_larger_in_usual_than_what_moves_the_outputs_by_their_error(
 
 def test_a_corner_that_splines_round_is_told_where_they_are_off_everywhere_alike() -> None:
     """Samples are dense about 0, and a curve is well known there, but for its smoothness."""
-    ground = VaneGround(chain()[1].stage("actuator"))
+    ground = VaneChainCandidates(chain()[1].stage("actuator"))
     theta = ground.whole.neutral()[: len(ground.whole.parameters)]
     c = next(c for c in ground.candidates(theta) if c.name == "valve.current.curve_of_i_cmd")
     x = 5.0 * np.linspace(-1.0, 1.0, 257) ** 3

@@ -15,36 +15,36 @@ from tests.firmware_on_rig import firmware
 from vaneloop.identification.selection.likelihood_acceptance import RIVAL_NATS, correlation_of
 from vaneloop.identification.unmodelled import parametric_preference as by_formula
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
-from vaneloop.identification.unmodelled.fitted_candidate import Tried
-from vaneloop.identification.unmodelled.learning import Learner
+from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
+from vaneloop.identification.unmodelled.learning import CurveSearch
 from vaneloop.identification.unmodelled.parametric_preference import said_first
 from vaneloop.identification.unmodelled.screening import SCREENED
-from vaneloop.identification.vane_chain.candidates import VaneGround, remade
+from vaneloop.identification.vane_chain.candidates import VaneChainCandidates, remade
 from vaneloop.identification.vane_chain.chain import build_chain
 
 SPEED, STROKE = "actuator.load.curve_of_n_r", "actuator.load.curve_of_x_lvdt"
 
 
 @lru_cache
-def learner_of(effect: str, sizes: tuple[tuple[str, float], ...], duration: float, *names: str) -> Learner:
+def learner_of(effect: str, sizes: tuple[tuple[str, float], ...], duration: float, *names: str) -> CurveSearch:
     """A search among a few curves on the stage of an effect of the rig, whose library has nothing."""
     hidden = rig.Hidden(effect, dict(sizes))
     test = rig.manoeuvre(11, duration)
     run = rig.simulate(test, firmware(), [hidden], seed=11, rate=100, randomised=False)
     chain = build_chain(Log("rig", {k: Channel(run.log["t"], v) for k, v in run.log.items() if k != "t"}))
-    ground = VaneGround(remade(chain.stage(rig.EFFECTS[effect].stage), (), ()))
+    ground = VaneChainCandidates(remade(chain.stage(rig.EFFECTS[effect].stage), (), ()))
     fit = SimpleNamespace(theta=ground.whole.neutral(), effects=())
     d: Any = SimpleNamespace(base=fit, final=fit, verdict="unknown", effects=[], nearest=[])
-    learner = Learner(ground, d)
+    learner = CurveSearch(ground, d)
     learner.candidates = [c for c in learner.candidates if c.name in names]
     return learner
 
 
 @lru_cache
-def with_load(force: float) -> tuple[Learner, Tried, list[Tried]]:
+def with_load(force: float) -> tuple[CurveSearch, FittedCandidate, list[FittedCandidate]]:
     """An air load of ``force`` (N) at full speed: the model as it is, and with curves of the speed and the stroke."""
     learner = learner_of("aero_load", (("force", force),), 60.0, SPEED, STROKE)
-    before = Tried(learner.candidates[0], 0.0, learner.judge, learner.base, ())
+    before = FittedCandidate(learner.candidates[0], 0.0, learner.judge, learner.base, ())
     begin = [np.append(learner.base.theta, np.zeros(len(c.parts))) for c in learner.candidates]
     both = zip(learner.candidates, begin, strict=True)
     return learner, before, [learner.fitted(before, c, SCREENED, theta, 12) for c, theta in both]
@@ -87,6 +87,6 @@ def test_candidates_are_ranked_on_all_samples(names: tuple[str, ...]) -> None:
     """In half a minute the links' lengths make up for anything."""
     learner = learner_of("linkage_compliance", (("compliance", 6e-4),), 90.0, *names)
     assert len(learner.ground.stage((), (), True).t) < len(learner.judge.stage.t)
-    learner._finalists(Tried(learner.candidates[0], 0.0, learner.judge, learner.base, ()))
+    learner._finalists(FittedCandidate(learner.candidates[0], 0.0, learner.judge, learner.base, ()))
     assert {len(t.judge.stage.t) for t in learner.ranked[0]} == {len(learner.judge.stage.t)}
     assert learner.ranked[0][0].candidate.name == names[0]

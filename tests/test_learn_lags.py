@@ -23,7 +23,7 @@ from tests import rig
 from tests.test_learn_vanes import WIDE, chain, columns, curved, law
 from vaneloop.base.errors import InputError
 from vaneloop.identification.user_models.hysteresis_regressors import lagged
-from vaneloop.identification.vane_chain.candidates import LAGGED, VaneGround, curve_effect, with_laws
+from vaneloop.identification.vane_chain.candidates import LAGGED, VaneChainCandidates, curve_effect, with_laws
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
 from vaneloop.identification.vane_chain.subsystem_data import Made
 
@@ -175,7 +175,7 @@ def test_lags_are_of_what_drives_a_stage() -> None:
     for stage in whole.stages:
         late = [
             c
-            for c in VaneGround(stage).candidates(stage.neutral()[: len(stage.parameters)])
+            for c in VaneChainCandidates(stage).candidates(stage.neutral()[: len(stage.parameters)])
             if c.quantity.remembers and not c.quantity.stops
         ]
         assert late

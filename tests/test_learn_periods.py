@@ -28,8 +28,8 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.tables import read
 from vaneloop.identification import StageError
 from vaneloop.identification.candidates.spline_basis import FINE_HARMONICS, waves_of
-from vaneloop.identification.unmodelled.fitted_candidate import Tried
-from vaneloop.identification.unmodelled.learning import Learner
+from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
+from vaneloop.identification.unmodelled.learning import CurveSearch
 from vaneloop.identification.unmodelled.spectral_lines import Course, Lines
 from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.exogenous_regressors import every
@@ -247,7 +247,7 @@ def test_its_file_says_the_same_to_another_log(humming, tmp_path) -> None:
         from_file(name, wrong, data)
 
 
-def step_of(learner: Learner, current: Tried) -> tuple[str | int, ...]:
+def step_of(learner: CurveSearch, current: FittedCandidate) -> tuple[str | int, ...]:
     """Which step of the search it is: numbers that the model has to begin with, and the curves that were learned."""
     return len(learner.base.theta), *(q.effect for q, _ in current.curves)
 
@@ -259,10 +259,10 @@ def learned_where_the_gain_drifts():
 @pytest.fixture(scope="module")
 def drifting():
     """What is learned beside a gain that drifts, its diagnosis, and the candidates that each step found."""
-    found: dict[tuple[str | int, ...], list[Tried]] = {}
+    found: dict[tuple[str | int, ...], list[FittedCandidate]] = {}
     diagnoses = []
 
-    def finalists(self, current: Tried) -> list[Tried]:
+    def finalists(self, current: FittedCandidate) -> list[FittedCandidate]:
         now = search(self, current)
         found.setdefault(step_of(self, current), now)
         return now
@@ -271,9 +271,9 @@ def drifting():
         diagnoses.append(diagnose(*words, **options))
         return diagnoses[-1]
 
-    search = Learner._finalists
+    search = CurveSearch._finalists
     with pytest.MonkeyPatch.context() as m:
-        m.setattr(Learner, "_finalists", finalists)
+        m.setattr(CurveSearch, "_finalists", finalists)
         m.setattr("vaneloop.verbs.learn.diagnose", diagnosed_once)
         return learned_where_the_gain_drifts(), *diagnoses, found
 
@@ -292,13 +292,13 @@ def test_a_hum_beside_a_gain_that_drifts_is_the_second_law(drifting) -> None:
 def test_a_second_law_that_harms_a_log_is_told_and_the_first_one_stands(drifting, monkeypatch) -> None:
     """The same logs, with the candidates that were found for them."""
     _, diagnosis, found = drifting
-    harmful = Learner.harmful
+    harmful = CurveSearch.harmful
 
     def second_harms(self, current, best) -> str:
         return "makes two worse" if current.curves else harmful(self, current, best)
 
-    monkeypatch.setattr(Learner, "harmful", second_harms)
-    monkeypatch.setattr(Learner, "_finalists", lambda self, current: found[step_of(self, current)])
+    monkeypatch.setattr(CurveSearch, "harmful", second_harms)
+    monkeypatch.setattr(CurveSearch, "_finalists", lambda self, current: found[step_of(self, current)])
     monkeypatch.setattr("vaneloop.verbs.learn.diagnose", lambda *_, **__: diagnosis)
     answer = learned_where_the_gain_drifts()
     (first,) = answer.laws

@@ -12,15 +12,15 @@ import pytest
 
 from tests.test_learn_vanes import rig_chain
 from vaneloop import Record, System, unknown
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.subsampled_search import LITTLE, excerpt_of
-from vaneloop.identification.unmodelled.curve_candidates import Candidate, OwnGround
-from vaneloop.identification.unmodelled.fitted_candidate import Ground, Tried
-from vaneloop.identification.unmodelled.learning import QUICK, TIMES, Learner
+from vaneloop.identification.unmodelled.curve_candidates import Candidate, UserModelCandidates
+from vaneloop.identification.unmodelled.fitted_candidate import CandidateSource, FittedCandidate
+from vaneloop.identification.unmodelled.learning import QUICK, TIMES, CurveSearch
 from vaneloop.identification.unmodelled.parametric_preference import leaves
 from vaneloop.identification.unmodelled.screening import screened
 from vaneloop.identification.user_models.by_log import bind
-from vaneloop.identification.vane_chain.candidates import VaneGround
+from vaneloop.identification.vane_chain.candidates import VaneChainCandidates
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 
@@ -36,14 +36,14 @@ TANK = System(
 )  # fmt: skip
 
 
-def learner_on(ground: Ground) -> Learner:
+def learner_on(ground: CandidateSource) -> CurveSearch:
     """A search where no law of the library was found."""
     fit = SimpleNamespace(theta=ground.whole.neutral(), effects=())
     d: Any = SimpleNamespace(base=fit, final=fit, verdict="unknown", effects=[], nearest=[])
-    return Learner(ground, d)
+    return CurveSearch(ground, d)
 
 
-def learner_of(outflow: tuple[float, float], seed: int) -> Learner:
+def learner_of(outflow: tuple[float, float], seed: int) -> CurveSearch:
     """A search on a log of a tank whose outflow goes from one value to another as its oil warms."""
     rng = np.random.default_rng(seed)
     t = 0.1 * np.arange(3000)
@@ -57,7 +57,7 @@ def learner_of(outflow: tuple[float, float], seed: int) -> Learner:
         for _ in range(10):
             level += 0.01 * (0.2 * pump[k] - out[k] * level)
     record = Record("log", t, {"pump": pump, "oil": oil, "level": y + 0.05 * rng.standard_normal(len(t))})
-    return learner_on(OwnGround(bind(TANK, [record], [])))
+    return learner_on(UserModelCandidates(bind(TANK, [record], [])))
 
 
 @pytest.mark.slow
@@ -65,7 +65,7 @@ def learner_of(outflow: tuple[float, float], seed: int) -> Learner:
 def test_what_goes_with_one_over_a_parameter_is_among_what_is_fitted(outflow: tuple[float, float], seed: int) -> None:
     """Four times the outflow is a quarter of the level: no step by slopes shows it, and sums of the oil seemed more."""
     learner = learner_of(outflow, seed)
-    current = Tried(learner.candidates[0], 0.0, learner.judge, learner.base, ())
+    current = FittedCandidate(learner.candidates[0], 0.0, learner.judge, learner.base, ())
     bare, promising = screened(learner, current, QUICK, TIMES[0])
     names, left = [c.name for _, c, _ in promising], [cost for cost, *_ in promising]
     assert left == sorted(left) and left[0] < 0.05 * bare
@@ -89,7 +89,7 @@ def test_pieces_that_stand_are_not_searched() -> None:
     """Where the stroke stands nobody knows where in their play the rings are: such a piece counts for nothing."""
     stage = standing_chain(slice(14_000, 20_000)).stage("linkage")
     assert stage.counted is not None and stage.floor is not None
-    judge = Judge(stage, stage.floor)
+    judge = LeastSquaresProblem(stage, stage.floor)
     at = excerpt_of(judge, judge.fit((), stage.neutral(), 1), 1_000, 4_000)
     part = stage.excerpt(at)
     assert len(at) == 4_000 and at.min() >= 13_000
@@ -103,7 +103,7 @@ def test_pieces_that_stand_are_not_searched() -> None:
 def test_where_few_pieces_count_the_excerpt_is_no_shorter() -> None:
     stage = standing_chain(slice(14_000, 15_500)).stage("linkage")
     assert stage.floor is not None
-    judge = Judge(stage, stage.floor)
+    judge = LeastSquaresProblem(stage, stage.floor)
     fit = judge.fit((), stage.neutral(), 1)
     for counted in (stage.counted, lambda rows: np.zeros(len(rows), dtype=bool), None):
         stage.counted = counted
@@ -114,7 +114,7 @@ def test_where_few_pieces_count_the_excerpt_is_no_shorter() -> None:
 @pytest.mark.slow
 def test_a_measured_angle_puts_no_other_quantity_behind() -> None:
     """What a stage gives, as it was measured, has the noise of its error in it: a curve takes a little of that off."""
-    learner = learner_on(VaneGround(standing_chain(slice(0, 24_000)).stage("linkage")))
+    learner = learner_on(VaneChainCandidates(standing_chain(slice(0, 24_000)).stage("linkage")))
     wanted = ("sensors.lvdt.curve_of_vgv1", "sensors.lvdt.curve_of_x_lvdt", "sensors.vgv1.curve_of_vgv1")
     echo, plain, own = (next(c for c in learner.candidates if c.name == name) for name in wanted)
     assert [learner._echoes(c) for c in (echo, plain, own)] == [True, False, False]
@@ -124,7 +124,7 @@ def test_a_measured_angle_puts_no_other_quantity_behind() -> None:
         some = np.random.default_rng(1).uniform(0.9, 1.1, learner.judge.n_blocks)
         held = float(learner.judge.n) / learner.judge.n_blocks * (1.0 + off * some)
         fit = SimpleNamespace(held_out=held, cost=held, theta=learner.base.theta, effects=())
-        return Tried(c, 0.0, learner.judge, fit, ())  # type: ignore[arg-type]
+        return FittedCandidate(c, 0.0, learner.judge, fit, ())  # type: ignore[arg-type]
 
     for first, behind in ((echo, False), (own, True)):
         good = [judged(first, -1e-3), judged(plain, 0.0)]

@@ -13,8 +13,8 @@ from hypothesis import strategies as some
 from vaneloop.base.curve import on_even, on_table
 from vaneloop.identification import Record, System, unknown
 from vaneloop.identification.least_squares import levenberg_marquardt as steps
-from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Carried, Known, LatestSlopes
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.broyden import NOT_KNOWN, BroydenJacobian, Known, LatestSlopes
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.subsystem import Array, Effect, Parameter, Stage
 from vaneloop.identification.unmodelled.curve_candidates import candidates, with_curves
 from vaneloop.identification.user_models import simulation as runner
@@ -45,7 +45,7 @@ def test_carried_slopes_say_what_the_last_step_did(seed: int) -> None:
     """The errors there less those before are the slopes times the step; the normal matrix is theirs."""
     rng = np.random.default_rng(seed)
     error, slopes, step = rng.standard_normal((1, 50)), rng.standard_normal((4, 1, 50)), rng.standard_normal(4)
-    carried, there = Carried(error, slopes.copy()), rng.standard_normal((1, 50))
+    carried, there = BroydenJacobian(error, slopes.copy()), rng.standard_normal((1, 50))
     carried.moved(step, there)
     np.testing.assert_allclose(-step @ carried.slopes, (there - error)[0], atol=1e-9)
     np.testing.assert_allclose(carried.normal, carried.slopes @ carried.slopes.T, atol=1e-8)
@@ -57,7 +57,7 @@ def test_a_linear_model_keeps_its_slopes() -> None:
     rng = np.random.default_rng(1)
     slopes, step = rng.standard_normal((3, 1, 40)), np.array([0.5, -2.0, 0.1])
     error = rng.standard_normal((1, 40))
-    carried = Carried(error, slopes.copy())
+    carried = BroydenJacobian(error, slopes.copy())
     carried.moved(step, error - (step @ slopes[:, 0])[None])
     np.testing.assert_allclose(carried.slopes, slopes[:, 0], atol=1e-12)
 
@@ -68,7 +68,7 @@ def test_a_fit_by_carried_slopes_ends_where_one_by_simulated_ones_does(monkeypat
     for limit, unit in ((400_000, 1.0), (0, 1.0), (400_000, 1e6)):
         monkeypatch.setattr(steps, "CARRIED", limit)
         asked: list[int] = []
-        judge = Judge(bent_stage(asked, 0.2, unit), np.array([1e-3]))
+        judge = LeastSquaresProblem(bent_stage(asked, 0.2, unit), np.array([1e-3]))
         start = np.array([0.3, 0.5 / unit])
         free = judge.columns(("law",))
         near = Known(free, judge.linearise(np.array([0.2, 0.6 / unit]), free)[1]) if limit else NOT_KNOWN
@@ -85,7 +85,7 @@ def test_a_fit_by_carried_slopes_ends_where_one_by_simulated_ones_does(monkeypat
 def test_wrong_slopes_lead_no_fit_astray() -> None:
     """Slopes of the wrong sign, or of another log's length, are simulated anew."""
     for rows in (-1.0, None):
-        judge = Judge(bent_stage([], 0.2), np.array([1e-3]))
+        judge = LeastSquaresProblem(bent_stage([], 0.2), np.array([1e-3]))
         free = judge.columns(("law",))
         slopes = judge.linearise(np.array([0.3, 0.5]), free)[1]
         near = Known(free, rows * slopes if rows else slopes[:, :, :300])
@@ -95,8 +95,8 @@ def test_wrong_slopes_lead_no_fit_astray() -> None:
 
 
 def test_a_fit_is_judged_by_slopes_that_were_simulated_at_its_end() -> None:
-    """Its gradients and normals are those of `Judge.linearise` there."""
-    judge = Judge(bent_stage([], 0.2), np.array([1e-3]))
+    """Its gradients and normals are those of `LeastSquaresProblem.linearise` there."""
+    judge = LeastSquaresProblem(bent_stage([], 0.2), np.array([1e-3]))
     fit = judge.fit(("law",), np.array([0.3, 0.5]), 20)
     judge._near = LatestSlopes()
     cost, gradients, normals = judge._blocks(*judge.linearise(fit.theta, fit.free))
@@ -107,16 +107,16 @@ def test_a_fit_is_judged_by_slopes_that_were_simulated_at_its_end() -> None:
 
 def test_no_descent_ends_by_carried_slopes(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last sets but one that it asks for are simulated slopes: it has not ended by what was carried."""
-    judge = Judge(bent_stage([], 0.2), np.array([1e-3]))
+    judge = LeastSquaresProblem(bent_stage([], 0.2), np.array([1e-3]))
     free = judge.columns(("law",))
     monkeypatch.setattr(judge, "_moves", [(None, None)] * 2)
-    kinds, task = [], steps.descent(judge, free, steps.Begin(np.array([0.3, 0.5])), 20)
+    kinds, task = [], steps.levenberg_marquardt(judge, free, steps.Begin(np.array([0.3, 0.5])), 20)
     end = drive(judge, task, kinds)
     assert 3 in kinds and 2 in kinds
     assert end.linear is not None or kinds[-2] == 2
 
 
-def drive(judge: Judge, task: Generator[Array, Array, Any], kinds: list[int]) -> Any:
+def drive(judge: LeastSquaresProblem, task: Generator[Array, Array, Any], kinds: list[int]) -> Any:
     """Run a task alone, noting how many sets it asks for each time."""
     try:
         asked = next(task)

@@ -27,10 +27,10 @@ from vaneloop.base.hysteresis import RADII, slipped, weights_of
 from vaneloop.cli.main import main
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.unmodelled.confirmation import another_confirms
-from vaneloop.identification.unmodelled.fitted_candidate import Tried
-from vaneloop.identification.unmodelled.learning import Learner
+from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
+from vaneloop.identification.unmodelled.learning import CurveSearch
 from vaneloop.identification.user_models.hysteresis_regressors import BEFORE, forgotten, of_stops
-from vaneloop.identification.vane_chain.candidates import LAGGED, SLIPS, VaneGround, with_laws
+from vaneloop.identification.vane_chain.candidates import LAGGED, SLIPS, VaneChainCandidates, with_laws
 from vaneloop.identification.vane_chain.chain import build_chain
 from vaneloop.identification.vane_chain.subsystem_data import Made
 
@@ -154,7 +154,7 @@ def test_stops_are_tried_where_something_slips_and_of_what_drives_the_stage() ->
     _, whole = chain()
     found = set()
     for stage in whole.stages:
-        for c in VaneGround(stage).candidates(stage.neutral()[: len(stage.parameters)]):
+        for c in VaneChainCandidates(stage).candidates(stage.neutral()[: len(stage.parameters)]):
             if c.quantity.stops:
                 q = quantity_of(c.quantity.name)
                 assert q is not None and q.stops and not c.mean and c.how == "adds"
@@ -189,19 +189,19 @@ def test_of_what_a_bushing_may_be_the_hysteresis_at_the_crank_is_best(monkeypatc
     """Of what all rings may have of the stroke's hysteresis, direction and way since it turned; another amplitude
     confirms it.
     """
-    every = VaneGround.candidates
+    every = VaneChainCandidates.candidates
 
     def some(self, theta):
         rivals = [f"linkage.ring.curve_of_{q}_x_lvdt" for q in ("direction_of", "distance_since_reversal_of")]
         return [c for c in every(self, theta) if c.name in (f"linkage.crank.curve_of_{BUSHING[1]}", *rivals)]
 
-    monkeypatch.setattr(VaneGround, "candidates", some)
+    monkeypatch.setattr(VaneChainCandidates, "candidates", some)
     (log,) = bushing_logs((51, 60.0))
-    ground = VaneGround(build_chain(Log("rig", log)).stage("linkage"))
+    ground = VaneChainCandidates(build_chain(Log("rig", log)).stage("linkage"))
     fit = SimpleNamespace(theta=ground.whole.neutral(), effects=())
     d: Any = SimpleNamespace(base=fit, final=fit, verdict="unknown", effects=[], nearest=[])
-    learner = Learner(ground, d)
-    before = Tried(learner.candidates[0], 0.0, learner.judge, learner.base, ())
+    learner = CurveSearch(ground, d)
+    before = FittedCandidate(learner.candidates[0], 0.0, learner.judge, learner.base, ())
     best = learner._finalists(before)[0]
     assert best.candidate.at == "linkage.crank"
     assert learner._earns(before, best) and another_confirms(learner, before, best)

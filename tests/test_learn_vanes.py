@@ -21,7 +21,7 @@ from tests import rig
 from tests.firmware_on_rig import firmware
 from vaneloop.base.errors import InputError
 from vaneloop.cli.main import main
-from vaneloop.identification.vane_chain.candidates import VaneGround, remade, reversals
+from vaneloop.identification.vane_chain.candidates import VaneChainCandidates, remade, reversals
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
 from vaneloop.verbs.learn import learned
 
@@ -158,7 +158,7 @@ def test_reversals_of_a_stroke() -> None:
 def test_candidates_are_places_times_quantities_that_say_something() -> None:
     _, whole = chain()
     for stage in whole.stages:
-        ground = VaneGround(stage)
+        ground = VaneChainCandidates(stage)
         some = ground.candidates(stage.neutral()[: len(stage.parameters)])
         assert some and len({c.name for c in some}) == len(some)
         for c in some:

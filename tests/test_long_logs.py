@@ -12,7 +12,7 @@ from hil.logs import Channel, Log
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
 from vaneloop.identification.chunked_residuals import BLOCKS, Failing, Sums, failing, joined, of_whole
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.vane_chain.candidates import remade
 from vaneloop.identification.vane_chain.resample import Grid, grid_of, on_raster
 from vaneloop.identification.workflow import diagnose
@@ -66,7 +66,7 @@ def test_errors_of_an_excerpt_are_those_that_the_log_has_there() -> None:
         for e in stage.effects:
             if e.name == "can_delay":
                 theta[stage.index()[e.name]] = 0.02
-        a, b = Judge(stage, full.floor), Judge(full, full.floor)
+        a, b = LeastSquaresProblem(stage, full.floor), LeastSquaresProblem(full, full.floor)
         both = a.valid & b.valid[:, rows]
         assert both.mean() > 0.7
         one, other = (np.where(both, e, 0.0) for e in (a.errors(theta[None])[0], b.errors(theta[None])[0][:, rows]))
@@ -86,7 +86,7 @@ def test_errors_of_the_whole_log_are_those_of_one_piece(monkeypatch: pytest.Monk
     assert not held.failing
     assert len(held.sums) == len(whole.stages) == 5
     for stage in whole.stages:
-        judge = Judge(stage, chain.stage(stage.name).floor)
+        judge = LeastSquaresProblem(stage, chain.stage(stage.name).floor)
         n = judge.valid.sum(axis=1)
         rms = np.sqrt((judge.errors(stage.neutral()[None])[0] ** 2).sum(axis=1) / n)
         assert held.sums[stage.name].rms()[0] == pytest.approx(rms, rel=0.02), stage.name

@@ -13,7 +13,7 @@ import pytest
 from tests.test_identification import FLOOR, GAIN, LIBRARY, NULL_BIAS, T, integrator, wave
 from tests.test_search_limits import SIDES, verdict
 from vaneloop.identification import Effect, Parameter, Stage
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.regimes import shape
 from vaneloop.identification.results import StageDiagnosis
 from vaneloop.identification.selection.diagnosis import diagnose_stage
@@ -158,6 +158,6 @@ def test_only_an_oscillation_of_the_machine_is_called_one(hertz, named):
     fast = 0.0 if hertz is None else 0.3 * np.sin(2.0 * np.pi * hertz * T)
     stage = integrator(effects=LIBRARY[:1], gain=GAIN, added=slow + fast)
     stage.memory = 10.0
-    judge = Judge(stage, FLOOR)
+    judge = LeastSquaresProblem(stage, FLOOR)
     texts = " ".join(s.text for s in shape(judge, judge.fit((), stage.neutral())))
     assert re.findall(r"oscillates at ([\d.]+) Hz", texts) == ([named] if named else [])

@@ -12,9 +12,9 @@ import pytest
 from controller import load_calibration
 from plant import build_plant
 from vaneloop.cli import extend
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import extend_stage
-from vaneloop.identification.selection.likelihood_acceptance import NoiseFloor
+from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
 from vaneloop.identification.selection.search import Search
 from vaneloop.identification.subsystem import Effect, Parameter, Stage
 from vaneloop.identification.vane_chain.chain import Chain
@@ -59,7 +59,7 @@ def rough_stage(seed: int) -> Stage:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_no_fit_is_worse_than_one_it_contains(seed):
-    search = Search(NoiseFloor(Judge(rough_stage(seed), np.array([0.1]))))
+    search = Search(LikelihoodAcceptance(LeastSquaresProblem(rough_stage(seed), np.array([0.1]))))
     total = search.judge.total_of
     names = [e.name for e in search.stage.effects]
     if search.quiet:

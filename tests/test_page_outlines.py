@@ -30,7 +30,7 @@ from vaneloop.design.scheduling import ScheduleResult
 from vaneloop.design.spatial import SpatialCheck
 from vaneloop.design.strategies import Failure, Outcome, Scenario
 from vaneloop.identification.candidates.closed_forms import Formula
-from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.regimes import Shape, locate
 from vaneloop.identification.results import Candidate, Found, StageDiagnosis
 from vaneloop.identification.subsystem import Effect, Parameter, Stage
@@ -287,7 +287,7 @@ def stage(name: str = "actuator", drift: float = 0.0, window: float | None = Non
 
 def fit_of(s: Stage, theta: tuple[float, float, float], effects: tuple[str, ...] = (), held_out: float = 1.21) -> Fit:
     """What a fit holds that ended at these parameters; its held-out error is a tenth above the fitted."""
-    judge = Judge(s, np.array([0.05, 0.2]))
+    judge = LeastSquaresProblem(s, np.array([0.05, 0.2]))
     at = np.array(theta)
     cost, free = judge.block_costs(judge.errors(at[None]))[0], judge.columns(effects)
     flat = np.zeros((judge.n_blocks, len(free)))
@@ -392,14 +392,14 @@ def test_the_next_experiment() -> None:
 def test_where_a_stage_fails() -> None:
     """One that fails everywhere, one that fails under one condition only, and one that fits."""
     fails, fits = stage(), stage("linkage")
-    located = [locate(Judge(fails, np.array([0.05, 0.2])), fit_of(fails, (1.02, 0.0, 0.0))),
-               locate(Judge(fits, np.array([0.05, 0.2])), fit_of(fits, (1.02, 0.5, 0.0)))]  # fmt: skip
+    located = [locate(LeastSquaresProblem(fails, np.array([0.05, 0.2])), fit_of(fails, (1.02, 0.0, 0.0))),
+               locate(LeastSquaresProblem(fits, np.array([0.05, 0.2])), fit_of(fits, (1.02, 0.5, 0.0)))]  # fmt: skip
     located[0] = replace(located[0], onset=31.4)
     bound = SimpleNamespace(stages=[fails, fits], not_observed={"servo": "no i_cmd in the log"}, notes=[])
     page = compare_page(located, bound, "vaneloop compare a.csv", "x/a.csv", None, TESTED)
     approve("compare", outline(page))
     bound.not_observed = {}
-    whole = locate(Judge(fits, np.array([0.05, 0.2])), fit_of(fits, (1.02, 0.5, 0.0), held_out=1.0))
+    whole = locate(LeastSquaresProblem(fits, np.array([0.05, 0.2])), fit_of(fits, (1.02, 0.5, 0.0), held_out=1.0))
     page = compare_page([whole], bound, "vaneloop locate", "a.csv", title="Where it fails")
     approve("locate_fits", "\n".join(outline(page).splitlines()[:12]) + "\n")
     assert [t.tone for t in page.tiles] == ["good"]

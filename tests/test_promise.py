@@ -7,9 +7,9 @@ import pytest
 
 from vaneloop import Record, System, unknown
 from vaneloop.identification.candidates.laws import STICTION, apply
-from vaneloop.identification.least_squares.problem import Judge
-from vaneloop.identification.selection.relative_error_acceptance import ErrorShare
-from vaneloop.identification.selection.screening import Slopes, _solved, along, followed, out_of, within
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance
+from vaneloop.identification.selection.screening import Linearisation, _solved, along, followed, out_of, within
 from vaneloop.identification.selection.search import Search
 from vaneloop.identification.subsystem import Effect, Parameter, Stage
 from vaneloop.identification.user_models.bound_system import BoundSystem, steps_seen
@@ -43,10 +43,10 @@ def linear_stage() -> Stage:
 
 
 def test_the_best_size_of_what_acts_linearly_follows_from_one_simulation():
-    judge = Judge(linear_stage(), np.array([0.05]))
+    judge = LeastSquaresProblem(linear_stage(), np.array([0.05]))
     base = judge.fit((), judge.stage.neutral())
     fit = judge.fit(("w",), base.theta)
-    slopes = Slopes(judge, base.theta, base.free, base.prior)
+    slopes = Linearisation(judge, base.theta, base.free, base.prior)
     for start in (0.2, 4.0):
         tried = base.theta.copy()
         tried[2] = start
@@ -58,7 +58,7 @@ def test_the_best_size_of_what_acts_linearly_follows_from_one_simulation():
 
 
 def test_a_gain_that_is_far_off_follows_at_once():
-    judge = Judge(linear_stage(), np.array([0.05]))
+    judge = LeastSquaresProblem(linear_stage(), np.array([0.05]))
     base = judge.fit((), judge.stage.neutral())
     start = np.array([5.0, -8.0, 0.7, 0.0, 0.5])
     thetas = [start]
@@ -128,7 +128,7 @@ def test_a_system_that_forgets_slowly_has_its_starts_fitted():
     slow = BoundSystem(system(0.02), [log(0.02, 1500)])
     assert slow.read_starts and [p.name for p in slow.stage.parameters[2:]] == ["start_rate", "start_angle"]
     assert slow.floor == pytest.approx(slow.data.noise())
-    fit = Judge(slow.stage, slow.floor).fit((), slow.stage.neutral())
+    fit = LeastSquaresProblem(slow.stage, slow.floor).fit((), slow.stage.neutral())
     assert float(np.sqrt(fit.cost.sum() / (2 * len(slow.t)))) == pytest.approx(1.0, abs=0.06)
     assert fit.theta[3] == pytest.approx(1.0, abs=0.01)  # the reading is off by some 0.03
     assert not BoundSystem(system(3.0), [log(3.0, 12000)]).read_starts
@@ -146,8 +146,8 @@ def test_a_law_that_holds_another_is_no_worse_than_it_though_it_was_fitted_first
     )  # fmt: skip
     flow = 3.0 * np.array(moved) + 0.1 * rng.standard_normal(N)
     bound = BoundSystem(system, [Record("valve", T, {"command": command, "flow": flow})])
-    judge = Judge(bound.thinned, bound.floor)
-    search = Search(ErrorShare(judge))
+    judge = LeastSquaresProblem(bound.thinned, bound.floor)
+    search = Search(RelativeErrorAcceptance(judge))
     first = judge.stage.neutral()
     first[judge.stage.index()["command.stiction"]] = 30.0, 1.0, 0.0  # wider than the motion: it never moves
     search.fits[frozenset(["command.stiction"])] = judge.fit(("command.stiction",), first, 1)
@@ -172,8 +172,8 @@ def test_stiction_is_found_on_from_the_play_that_stands_in_for_it(width: float, 
         states={"flow": "%"}, outputs={"flow": "%"}, parameters=[unknown("rate", 1.0, "1/s")], places=["command"],
     )  # fmt: skip
     bound = BoundSystem(system, [Record("valve", t, {"command": command, "flow": flow})])
-    judge = Judge(bound.thinned, bound.floor)
-    search = Search(ErrorShare(judge))
+    judge = LeastSquaresProblem(bound.thinned, bound.floor)
+    search = Search(RelativeErrorAcceptance(judge))
     play, stiction = search.single("command.play"), search.single("command.stiction")
     found = stiction.theta[judge.stage.index()["command.stiction"]]
     assert judge.total_of(stiction) < 1.1 * judge.n < judge.total_of(play) / 1.2
@@ -192,7 +192,7 @@ def test_quick_steps_lead_where_the_fit_goes_with_fewer_simulations(iterations: 
     bound = BoundSystem(system, [Record("bent", T, {"u": u, "y": y})])
     asked: list[int] = []
 
-    class Counting(Judge):
+    class Counting(LeastSquaresProblem):
         def _simulated(self, thetas):
             asked.append(len(thetas))
             return super()._simulated(thetas)

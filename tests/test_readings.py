@@ -12,7 +12,7 @@ import pytest
 from hil.logs import Channel, Log
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import StageDiagnosis, rms_per_output
 from vaneloop.identification.selection.diagnosis import diagnose_stage
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
@@ -74,7 +74,7 @@ def test_noise_in_the_loop_asks_for_no_soft_oil_and_leaves_no_error(seed: int) -
     for name, most in (("actuator", 0.02), ("servo", 0.15), ("linkage", 0.03)):
         stage = chain.stage(name)
         assert stage.floor is not None
-        judge = Judge(stage, stage.floor)
+        judge = LeastSquaresProblem(stage, stage.floor)
         fit = judge.fit((), stage.neutral())
         assert np.sqrt(fit.held_out.sum() / judge.n) == pytest.approx(1.0, abs=most), name
         if name == "actuator":
@@ -125,17 +125,17 @@ def test_a_valve_with_hysteresis_is_found_though_it_turns_between_the_rows() -> 
 
 def test_many_effects_that_leave_much_are_an_imitation() -> None:
     """Three effects that bring an error from 6 to 2 floors: enough of it for one effect, not for three."""
-    from vaneloop.identification.least_squares.problem import Judge
-    from vaneloop.identification.selection.likelihood_acceptance import NoiseFloor
+    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+    from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
 
     stage = chain_of(recorded([], 37, 100, 60.0)).stage("engine")
     assert stage.floor is not None
-    judge = Judge(stage, stage.floor)
+    judge = LeastSquaresProblem(stage, stage.floor)
     base = judge.fit((), stage.neutral(), 2)
     before, after = (replace(base, held_out=base.held_out * r**2 / (base.held_out.sum() / judge.n)) for r in (6.0, 2.0))
 
     def verdict(*effects: str) -> str:
-        return NoiseFloor(judge).conclude(before, replace(after, effects=effects), [], [], []).verdict
+        return LikelihoodAcceptance(judge).conclude(before, replace(after, effects=effects), [], [], []).verdict
 
     assert verdict("a") == "missing" and verdict("a", "b", "c") == "unknown"
 
@@ -144,7 +144,7 @@ def test_a_stroke_far_behind_is_smoothed_no_rounder_than_it_was() -> None:
     """The linkage takes the lag off the smoothed stroke: what smoothing cut off its corners would ask for more laws."""
     stage = chain_of(recorded([Hidden("lvdt_lag", {"time_constant": 0.0267})], 55, 100)).stage("linkage")
     assert stage.floor is not None
-    judge, start = Judge(stage, stage.floor), stage.neutral()
+    judge, start = LeastSquaresProblem(stage, stage.floor), stage.neutral()
     lag = stage.index()["lvdt_lag"].start
     start[lag] = 0.03
     fit = judge.fit(("lvdt_lag",), start, 8)

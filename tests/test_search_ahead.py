@@ -22,12 +22,12 @@ from tests.test_identification import (
     names,
     search,
 )
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import StageDiagnosis
-from vaneloop.identification.selection.likelihood_acceptance import NoiseFloor
+from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
 from vaneloop.identification.selection.screening import _best_within
 from vaneloop.identification.selection.search import Search
-from vaneloop.identification.selection.subsampled_search import Scouted, searched
+from vaneloop.identification.selection.subsampled_search import SubsampledSearch, searched
 from vaneloop.identification.subsystem import Stage
 
 AHEAD = 3_000  # samples of the excerpt
@@ -113,9 +113,9 @@ def test_clean_data_lack_nothing(seed: int) -> None:
 def test_what_acts_linearly_leaves_what_was_promised() -> None:
     terms = [linear("slope", (1, 1, 1), V), linear("tilt", (1, 0, -1), W)]
     stage = with_excerpts(gauges(terms, [0.31, 0.17], bias=0.05))
-    judge = Judge(stage, GAUGE_FLOOR)
-    found = searched(NoiseFloor(judge), NoiseFloor, None)
-    assert isinstance(found, Scouted)
+    judge = LeastSquaresProblem(stage, GAUGE_FLOOR)
+    found = searched(LikelihoodAcceptance(judge), LikelihoodAcceptance, None)
+    assert isinstance(found, SubsampledSearch)
     for name, level in found.level.items():
         alone = judge.fit((name,), found.starts[name][0], 8)
         assert level == pytest.approx(float(alone.cost.sum()), rel=1e-6)
@@ -125,7 +125,7 @@ def test_what_acts_linearly_leaves_what_was_promised() -> None:
 def test_a_short_log_is_searched_whole() -> None:
     stage = with_excerpts(integrator(1, null_bias=0.4))
     short = stage.excerpt(np.arange(2 * AHEAD - 100)) if stage.excerpt else stage
-    assert type(searched(NoiseFloor(Judge(short, FLOOR)), NoiseFloor, None)) is Search
+    assert type(searched(LikelihoodAcceptance(LeastSquaresProblem(short, FLOOR)), LikelihoodAcceptance, None)) is Search
 
 
 @pytest.mark.parametrize("seed", range(20))

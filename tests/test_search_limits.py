@@ -22,10 +22,10 @@ from vaneloop.identification import regimes as locate
 from vaneloop.identification import results as stage_answer
 from vaneloop.identification import workflow
 from vaneloop.identification.least_squares import problem as fit
-from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.selection import diagnosis as diagnose
 from vaneloop.identification.selection import likelihood_acceptance as noise_floor
-from vaneloop.identification.selection.likelihood_acceptance import NoiseFloor
+from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
 from vaneloop.identification.selection.search import Search
 from vaneloop.identification.subsystem import Effect, Parameter, Stage
 
@@ -53,7 +53,7 @@ def test_the_page_documents_the_numbers_that_are_in_force():
 
 
 def judge_of(blocks: int, each: int) -> Any:
-    """What a decision asks of a `Judge`: how many samples, and where."""
+    """What a decision asks of a `LeastSquaresProblem`: how many samples, and where."""
     return SimpleNamespace(
         n=blocks * each, samples=np.full(blocks, each), n_blocks=blocks, expected=lambda: np.ones(blocks)
     )
@@ -131,7 +131,9 @@ def verdict(monkeypatch: pytest.MonkeyPatch, before: float, after: float, effect
     for module in (noise_floor, stage_answer):
         monkeypatch.setattr(module, "rms_per_output", lambda *_: np.ones(1))
     monkeypatch.setattr(stage_answer, "recalibrated", lambda *_: [])
-    return NoiseFloor(judge).conclude(fit_of(before, judge), fit_of(after, judge, effects), [], [], []).verdict
+    return (
+        LikelihoodAcceptance(judge).conclude(fit_of(before, judge), fit_of(after, judge, effects), [], [], []).verdict
+    )
 
 
 @SIDES
@@ -206,7 +208,7 @@ class Endless:
         self.judge, self.stage, self.criterion, self.quiet, Endless.asked = (
             judge,
             judge.stage,
-            NoiseFloor(judge),
+            LikelihoodAcceptance(judge),
             False,
             [],
         )
@@ -248,7 +250,7 @@ def test_the_five_leaders_are_tried_in_pairs_and_no_more_than_four_effects_are_t
 def test_the_three_leading_sets_are_finished() -> None:
     search: Any = object.__new__(Search)
     judge = judge_of(2, 10)
-    search.criterion, search.fits = NoiseFloor(judge), {}
+    search.criterion, search.fits = LikelihoodAcceptance(judge), {}
     finished = []
 
     def joined(effects: tuple[str, ...], whole: bool) -> Any:
@@ -275,7 +277,7 @@ def test_a_stage_of_sixty_thousand_samples_is_searched_on_forty_thousand_in_piec
     def judge(stage: Any, *_: Any) -> Any:
         return SimpleNamespace(stage=stage, fit=lambda *_: nothing, errors=lambda _: np.ones((1, 1, len(stage.t))))
 
-    monkeypatch.setattr(diagnose, "Judge", judge)
+    monkeypatch.setattr(diagnose, "LeastSquaresProblem", judge)
     monkeypatch.setattr(diagnose, "recalibrate", lambda _: nothing)
     for n in (59_999, 60_000, 200_000):
         whole: Any = SimpleNamespace(t=0.01 * np.arange(n), window=1.0, coarse={}, counted=None)
@@ -312,18 +314,18 @@ def straight(n: int, dt: float, noise: float = 0.1, tolerance: float = 0.0) -> S
 def test_a_log_is_cut_into_blocks_of_ten_seconds_twelve_at_least_and_sixty_at_most(seconds: float, blocks: int) -> None:
     stage = straight(round(seconds / 0.1) + 1, 0.1)
     stage.memory = 10.0
-    assert Judge(stage, np.ones(1)).n_blocks == blocks
+    assert LeastSquaresProblem(stage, np.ones(1)).n_blocks == blocks
 
 
 @pytest.mark.parametrize("dt", [1e-4, 0.1, 3600.0])
 def test_blocks_of_a_stage_of_unknown_memory_do_not_turn_on_the_unit_of_time(dt: float) -> None:
-    assert Judge(straight(301, dt), np.ones(1)).n_blocks == 24
+    assert LeastSquaresProblem(straight(301, dt), np.ones(1)).n_blocks == 24
 
 
 @pytest.mark.parametrize(("n", "worth"), [(150, 150), (20_000, 200)])
 def test_a_log_is_worth_two_hundred_observations_at_most(n: int, worth: float) -> None:
     """Interval of a slope over a sine: 1.645 sqrt(2 / N) noises, N no more than 200."""
-    found = Judge(straight(n, 40.0 * np.pi / n), np.array([0.1])).fit(("slope",), np.zeros(2))
+    found = LeastSquaresProblem(straight(n, 40.0 * np.pi / n), np.array([0.1])).fit(("slope",), np.zeros(2))
     assert found.high[0] - found.low[0] == pytest.approx(
         2.0 * 1.645 * 0.1 * np.sqrt(2.0 / worth), rel=0.07 if n > 1000 else 0.12
     )
@@ -331,7 +333,7 @@ def test_a_log_is_worth_two_hundred_observations_at_most(n: int, worth: float) -
 
 def test_derivatives_are_taken_over_a_thousandth_of_a_parameters_scale() -> None:
     stage = straight(200, 0.1)
-    judge = Judge(stage, np.ones(1))
+    judge = LeastSquaresProblem(stage, np.ones(1))
     judge.linearise(np.zeros(2), np.array([1]))
     steps = stage.asked[-1][:, 1]  # type: ignore[attr-defined]
     assert np.allclose(np.sort(steps), [0.0, 2.0 * 1e-3], rtol=1e-12)
@@ -391,7 +393,7 @@ def test_the_shape_of_what_is_left_is_told_a_tenth_above_the_floor(
     work = workflow._Work([SimpleNamespace()])  # type: ignore[list-item]
     monkeypatch.setattr(workflow, "diagnose_stage", lambda *_, **__: said)
     monkeypatch.setattr(workflow, "floor_of", lambda *_: np.ones(1))
-    monkeypatch.setattr(workflow, "Judge", lambda *_: None)
+    monkeypatch.setattr(workflow, "LeastSquaresProblem", lambda *_: None)
     monkeypatch.setattr(workflow, "shape", lambda *_: ["a shape"])
     assert workflow._one(work, 0) == (said, ["a shape"] if beyond else [])
 
@@ -401,7 +403,7 @@ def test_the_limits_of_work_done_at_one_time_change_no_answer(monkeypatch: pytes
     for sets, values in ((64, 8_000_000), (2, 500)):
         monkeypatch.setattr(fit, "MAX_SETS", sets)
         monkeypatch.setattr(fit, "MAX_VALUES", values)
-        judge = Judge(straight(300, 0.1), np.ones(1))
+        judge = LeastSquaresProblem(straight(300, 0.1), np.ones(1))
         many = judge.together([judge.fitting(("slope",), np.array([0.0, s])) for s in (-1.0, 0.5, 2.0)])
         answers.append([f.theta.tolist() for f in many])
     assert answers[0] == answers[1]

@@ -471,5 +471,5 @@ def test_what_holds_arrays_is_compared_by_identity() -> None:
     while more := {n for n, of in fields.items() if n not in arrays and arrays & set(re.findall(r"\w+", " ".join(of)))}:
         arrays |= more
     holders = arrays & identity.keys()
-    assert {"Fit", "Tried", "Stage"} <= holders
+    assert {"Fit", "FittedCandidate", "Stage"} <= holders
     assert [n for n in sorted(holders) if not identity[n]] == []

@@ -583,7 +583,7 @@ def test_which_stages_are_asked_for_laws(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(
         "vaneloop.identification.unmodelled.likelihood_acceptance.above_the_noise", lambda judge, base: noisy[-1]
     )
-    monkeypatch.setattr("vaneloop.identification.least_squares.problem.Judge", lambda stage, floor: None)
+    monkeypatch.setattr("vaneloop.identification.least_squares.problem.LeastSquaresProblem", lambda stage, floor: None)
     for made, verdict, above, asked in (
         ("x", "missing", True, False), ("x", "unknown", False, True), ("x", "none", True, True),
         ("x", "none", False, False), (None, "unknown", True, False),
@@ -620,9 +620,10 @@ class Learning:
             return SimpleNamespace(learned=lambda: says[d.stage], judge="judge", base="base")
 
         monkeypatch.setattr(learn, "_open", lambda chain, d: d.verdict != "missing")
-        monkeypatch.setattr(f"{unmodelled}.learning.Learner", learner)
+        monkeypatch.setattr(f"{unmodelled}.learning.CurveSearch", learner)
         monkeypatch.setattr(
-            "vaneloop.identification.vane_chain.candidates.VaneGround", lambda stage, floor, test: (stage.name, test)
+            "vaneloop.identification.vane_chain.candidates.VaneChainCandidates",
+            lambda stage, floor, test: (stage.name, test),
         )
         monkeypatch.setattr(
             f"{unmodelled}.learned_law.law_of", lambda ground, before, tried: law(tried.name, before=before)
@@ -945,7 +946,8 @@ class Own:
         self.by_log = SimpleNamespace(model=Model(meta={"x": 1}), json=dict)
         self.errors = errors
         for at, said in (
-            (f"{unmodelled}.learning.Learner", self.learner), (f"{unmodelled}.curve_candidates.OwnGround", "ground"),
+            (f"{unmodelled}.learning.CurveSearch", self.learner),
+            (f"{unmodelled}.curve_candidates.UserModelCandidates", "ground"),
             (f"{unmodelled}.curve_candidates.on_logs", "logs on"), (f"{answers}.rms_of", 4.0),
             (f"{answers}.found_of", "found"), (f"{answers}.answer_of", self.answer()),
             ("vaneloop.identification.user_models.by_log.ByLog.of", self.by_log),
@@ -986,7 +988,7 @@ class Own:
 def test_laws_of_a_system_are_held_against_its_model_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     own = Own(monkeypatch)
     said = own.learned()
-    assert own.asked["Learner"] == [("ground", "first", own.told.append, ("odd",), False)]
+    assert own.asked["CurveSearch"] == [("ground", "first", own.told.append, ("odd",), False)]
     assert own.asked["law_of"] == [
         ("ground", ("judge", own.learner.base), "a"), ("ground", (own.judge, "fit of a"), "b"),
     ]  # fmt: skip
@@ -1101,7 +1103,9 @@ class Beside(Own):
         models = "vaneloop.identification.user_models.by_log"
         monkeypatch.setattr(f"{models}.bind", lambda *a: self.bound.append(a) or self.again)
         monkeypatch.setattr(f"{models}.as_given", lambda logs, fit: self.given)
-        monkeypatch.setattr("vaneloop.identification.least_squares.problem.Judge", lambda stage, floor: self.judge)
+        monkeypatch.setattr(
+            "vaneloop.identification.least_squares.problem.LeastSquaresProblem", lambda stage, floor: self.judge
+        )
         monkeypatch.setattr(learn, "_learned", lambda again, *a: self.bound.append((again, *a)) or self.said)
 
     def beside(self, alone: Any = None) -> Any:

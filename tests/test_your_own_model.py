@@ -18,7 +18,7 @@ from tests.browser import open_to_all
 from vaneloop.base.spline_rates import SplineRates
 from vaneloop.cli.main import main
 from vaneloop.identification import Parameter, Record, StageError, System, load_system, unknown
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.unmodelled.curve_candidates import candidates
 from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.data import Data
@@ -465,7 +465,7 @@ def test_a_law_of_a_model_file_that_is_0_can_be_fitted() -> None:
     bound = BoundSystem(system, [tanks(1, True)], present=nothing)
     share = next(p for p in bound.stage.parameters if p.name.endswith(".share"))
     assert share.tolerance > 0.1
-    judge = Judge(bound.stage, bound.floor)
+    judge = LeastSquaresProblem(bound.stage, bound.floor)
     fit = judge.fit((), bound.stage.neutral(), 12)
     at = [p.name for p in bound.stage.parameters].index(share.name)
     assert fit.theta[at] == pytest.approx(1.0, abs=0.05)

@@ -311,7 +311,7 @@ def judge_case(
 
     from hil.logs import Channel, read_log, write_log
     from plant import build_plant
-    from vaneloop.identification.least_squares.problem import Judge
+    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
     from vaneloop.identification.vane_chain.chain import build_chain
     from vaneloop.identification.workflow import diagnose, diagnosis_json
     from vaneloop.verbs.search import not_given
@@ -367,7 +367,7 @@ def judge_case(
                     continue
                 figures = []
                 for s in (with_it, without):
-                    judge = Judge(s, without.floor)
+                    judge = LeastSquaresProblem(s, without.floor)
                     figures.append(float(np.sqrt(judge.fit((), s.neutral()).held_out.sum() / judge.n)))
                 best = max(best, (figures[0] - figures[1]) * np.sqrt(2.0 * judge.n))
             detectable.append(bool(best > 3.0))

@@ -19,7 +19,7 @@ from plant.curve import PLACES
 from plant.effects import EFFECTS
 from vaneloop.base.curve import splines
 from vaneloop.identification.candidates.spline_basis import basis_of
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
 from vaneloop.identification.unmodelled.regressors import Quantity
@@ -49,7 +49,7 @@ def with_effect(stage: Stage, name: str, sizes: Mapping[str, float]) -> tuple[Ar
     theta = true.neutral()
     for k, p in enumerate(true.effects[0].parameters):
         theta[true.index()[name].start + k] = sizes.get(p.name, p.value)
-    theta = Judge(true, stage.floor).fit((), theta).theta
+    theta = LeastSquaresProblem(true, stage.floor).fit((), theta).theta
     return theta[: len(stage.parameters)], true.run(theta[None])[0]
 
 
@@ -77,7 +77,7 @@ def like_it(
     left, fitted = [], np.zeros(0)
     for one in (replace(c, untold=tuple(range(1, len(c.kept)))), c):  # its mean alone, and all of it
         curved = replace(remade(stage, (), ((one.placed(), one.effect(LOOSE)),)), measured=told)
-        judge = Judge(curved, stage.floor)
+        judge = LeastSquaresProblem(curved, stage.floor)
         judge.spared = set(range(len(own)))
         fit = judge.fit((of,), np.concatenate([own, np.zeros(len(one.kept))]), 20)
         left.append(float(np.sum(judge.errors(fit.theta[None]) ** 2)))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.regimes import AGREES, stands_out
 from vaneloop.identification.results import StageDiagnosis
 from vaneloop.identification.selection.likelihood_acceptance import EXPLAINED, leaves_too_much
@@ -57,7 +57,7 @@ def sums_of(stage: Stage, floor: Array, thetas: Array, first: int, behind: int, 
 
     rows  of the log's raster in a block; row 0 is at t = 0
     """
-    judge = Judge(stage, floor)
+    judge = LeastSquaresProblem(stage, floor)
     dt = float(stage.t[1] - stage.t[0])
     block = (stage.t / dt + 0.5).astype(int) // rows - first
     use = (block >= 0) & (block < behind - first)

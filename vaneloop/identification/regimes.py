@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vaneloop.identification.least_squares.problem import Fit, Judge, recalibrate
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
 from vaneloop.identification.results import rms_per_output
 from vaneloop.identification.subsystem import KNOWN_TO, Array, without_jumps
 
@@ -171,7 +171,7 @@ class Located:
         }  # fmt: skip
 
 
-def locate(judge: Judge, fit: Fit | None = None) -> Located:
+def locate(judge: LeastSquaresProblem, fit: Fit | None = None) -> Located:
     """Where the stage fails with nothing added. ``fit``: its nominal parameters refitted, where that has been done
     (`recalibrate`).
     """
@@ -203,7 +203,7 @@ def _edges(values: Array) -> Array:
     return edges
 
 
-def regimes(judge: Judge, fit: Fit, correlation: float) -> list[Regime]:
+def regimes(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> list[Regime]:
     """Error of every output against every condition of the stage, most telling first.
 
     A bin is significant where what is left of it without its worst block of the log is too: one slam that the equations
@@ -281,7 +281,7 @@ def _greatest(bin_of: Array, size: Array, t: Array, bins: int) -> Array:
     return out
 
 
-def onset(judge: Judge, fit: Fit) -> float | None:
+def onset(judge: LeastSquaresProblem, fit: Fit) -> float | None:
     """Time (s) at which the error rises for good; None if it has no onset inside the log."""
     e = judge.errors(fit.theta[None])[0]
     t = judge.stage.t
@@ -329,7 +329,7 @@ class Shape:
     y_unit: str
 
 
-def shape(judge: Judge, fit: Fit, noise: float = 1.0) -> list[Shape]:
+def shape(judge: LeastSquaresProblem, fit: Fit, noise: float = 1.0) -> list[Shape]:
     """Describe the remaining error of each output: the feature that explains most of it, and how.
 
     For a stage that integrates, the slope of the error is described (an effect there adds speed); else the error

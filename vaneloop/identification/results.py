@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.selection.calibration import trust
 from vaneloop.identification.subsystem import Array, Stage
 
@@ -87,7 +87,7 @@ class StageDiagnosis:
     notes: list[str] = field(default_factory=list)  # what decided between rivals, what was left out, in words
 
 
-def rms_of(judge: Judge, fit: Fit) -> float:
+def rms_of(judge: LeastSquaresProblem, fit: Fit) -> float:
     """RMS of the held-out error, in noise floors."""
     return float(np.sqrt(max(fit.held_out.sum(), 0.0) / max(judge.n, 1)))
 
@@ -104,7 +104,7 @@ def weigh(d: StageDiagnosis) -> None:
         f.probability = f.probabilities[f.effect]
 
 
-def rms_per_output(judge: Judge, fit: Fit) -> Array:
+def rms_per_output(judge: LeastSquaresProblem, fit: Fit) -> Array:
     """RMS error of each output in its unit, scaled from fitted to held-out blocks."""
     e = judge.errors(fit.theta[None])[0] * judge.floor[:, None]
     counts = np.maximum(judge.valid.sum(axis=1), 1)
@@ -137,7 +137,7 @@ def parameters_of(stage: Stage, fit: Fit, name: str) -> dict[str, dict[str, obje
     return out
 
 
-def found_of(judge: Judge, fit: Fit, effects: tuple[str, ...], without: Mapping[str, Fit]) -> list[Found]:
+def found_of(judge: LeastSquaresProblem, fit: Fit, effects: tuple[str, ...], without: Mapping[str, Fit]) -> list[Found]:
     """Effects of a fit that was asked for: no rivals looked for, probability 1 by decree.
 
     without  effect -> fit of all the others
@@ -164,7 +164,7 @@ def recalibrated(stage: Stage, fit: Fit) -> list[dict[str, object]]:
 
 
 def answer_of(
-    judge: Judge,
+    judge: LeastSquaresProblem,
     verdict: str,
     base: Fit,
     fit: Fit,

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from vaneloop.base.side_by_side import forks, in_processes
-from vaneloop.identification.least_squares.problem import Fit, Judge, recalibrate
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
 from vaneloop.identification.regimes import Located, Shape, StageFigures, agrees, locate, shape
 from vaneloop.identification.results import StageDiagnosis, parameters_of, recalibrated, rms_per_output, weigh
 from vaneloop.identification.selection.diagnosis import Judged, diagnose_stage, extend_stage, floor_of
 from vaneloop.identification.selection.likelihood_acceptance import (
     NATS,
-    NoiseFloor,
+    LikelihoodAcceptance,
     as_close,
     correlation_of,
     significant,
@@ -51,7 +51,7 @@ def locate_stages(stages: Sequence[Stage], progress: Callable[[float, str], None
     for i, stage in enumerate(stages):
         if progress:
             progress(i / len(stages), stage.name)
-        out.append(locate(Judge(stage, floor_of(stage))))
+        out.append(locate(LeastSquaresProblem(stage, floor_of(stage))))
     return out
 
 
@@ -86,7 +86,7 @@ class _Work:
     fits    fits made by each stage, numbers that all processes of the search see
     """
 
-    def __init__(self, stages: Sequence[Stage], judged: Judged = NoiseFloor):
+    def __init__(self, stages: Sequence[Stage], judged: Judged = LikelihoodAcceptance):
         self.stages, self.judged = list(stages), judged
         self.fits: list[Any] = [multiprocessing.RawValue("l", 0) for _ in self.stages]
 
@@ -102,14 +102,14 @@ def _one(work: _Work, i: int, tell: Callable[[], None] | None = None) -> tuple[S
     d = as_compared(stage, diagnose_stage(stage, floor_of(stage), tick=tick, judged=work.judged))
     if d.verdict == "none" and d.criterion == "noise_floor":
         d = _under_every_condition(stage, d)
-    return d, shape(Judge(stage, d.floor), d.final) if _leaves(d) else []
+    return d, shape(LeastSquaresProblem(stage, d.floor), d.final) if _leaves(d) else []
 
 
 def _under_every_condition(stage: Stage, d: StageDiagnosis) -> StageDiagnosis:
     """The answer "none", or "unknown" where `locate` finds a condition under which the stage fails: over the whole log
     little is above the noise, in one place it is.
     """
-    hot = locate(Judge(stage, d.floor), d.final).hot
+    hot = locate(LeastSquaresProblem(stage, d.floor), d.final).hot
     return replace(d, verdict="unknown", refused=[f"fails at {hot[0].worst()}"]) if hot else d
 
 
@@ -119,7 +119,7 @@ def as_compared(stage: Stage, d: StageDiagnosis) -> StageDiagnosis:
     """
     floor = floor_of(stage)
     if not np.array_equal(d.floor, floor):
-        judge = Judge(stage, floor)
+        judge = LeastSquaresProblem(stage, floor)
         d.base = recalibrate(judge)
         d.error_before = rms_per_output(judge, d.base)
         if not d.final.effects:
@@ -137,7 +137,7 @@ def diagnose(
     not_observed: dict[str, str] | None = None,
     progress: Callable[[float], None] | None = None,
     workers: int = 2,
-    judged: Judged = NoiseFloor,
+    judged: Judged = LikelihoodAcceptance,
     news: Callable[[News], None] | None = None,
 ) -> Diagnosis:
     """Search every stage for missing effects; stages run side by side in ``workers`` processes where the system can
@@ -223,7 +223,7 @@ def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
     place if it explains as much; else the stage's answer is "unknown".
     """
     for d in results:
-        judge = Judge(stages[d.stage], d.floor)
+        judge = LeastSquaresProblem(stages[d.stage], d.floor)
         for k, f in enumerate(d.effects):
             elsewhere = {
                 m: [o for o in results if o is not d and o.verdict != "unknown" and m in stages[o.stage].index()]
@@ -277,7 +277,7 @@ def _doubt(other: StageDiagnosis, effect: str) -> float:
 NEAR = 0.5  # share of its size by which a stage may be wrong about an effect that another stage sees too
 
 
-def _with(judge: Judge, sources: dict[str, Fit]) -> Fit:
+def _with(judge: LeastSquaresProblem, sources: dict[str, Fit]) -> Fit:
     """Fit exactly these effects, each started from its size in the fit given; the last one's nominal parameters too."""
     index, start = judge.stage.index(), judge.stage.neutral()
     for name, fit in sources.items():
@@ -304,7 +304,7 @@ def _fits(
     size = np.clip(there, fit.low[at] - wider, fit.high[at] + wider)
     if np.array_equal(size, there):
         return True
-    judge = Judge(stage, other.floor)
+    judge = LeastSquaresProblem(stage, other.floor)
     start = other.final.theta.copy()
     start[theirs] = size
     held = judge.fit(tuple(e for e in other.final.effects if e != effect), start, 6)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vaneloop.base.signals import heading
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.regimes import Located, locate
 from vaneloop.identification.results import StageDiagnosis
 from vaneloop.identification.subsystem import Bound, Stage
@@ -148,7 +148,7 @@ def compare_page(
     _tested(page, tested)
     for x in located:
         page.text(f"{x.stage}: {x.verdict()}.")
-        judge = Judge(_stage(bound, x.stage), x.floor)
+        judge = LeastSquaresProblem(_stage(bound, x.stage), x.floor)
         drawn = _curves(page, judge, [("model", x.fit.theta, "error")], f"{x.stage}: measured and model")
         _failure_map(page, x, drawn)
     if by_log is not None:
@@ -320,7 +320,7 @@ def _floors_anew(page: Page, d: Diagnosis, bound: Bound) -> None:
 
 def _stage_story(page: Page, s: StageDiagnosis, bound: Bound, extended: bool) -> None:
     stage = _stage(bound, s.stage)
-    judge = Judge(stage, s.floor)
+    judge = LeastSquaresProblem(stage, s.floor)
     page.section(f"The {s.stage} stage", f"Verdict: {word(s, extended)}.{_correlated(s.correlation)}")
     page.plot(
         waterfall(falling(s), "held-out error [noise floors]", floor=1.0, told=floors),
@@ -357,7 +357,7 @@ def _stage_story(page: Page, s: StageDiagnosis, bound: Bound, extended: bool) ->
         )  # fmt: skip
 
 
-def _curves(page: Page, judge: Judge, models: list[tuple[str, np.ndarray, str]], caption: str) -> int:
+def _curves(page: Page, judge: LeastSquaresProblem, models: list[tuple[str, np.ndarray, str]], caption: str) -> int:
     """Draw what was measured under what each model says, and the errors; return the number of the plot."""
     stage = judge.stage
     e = judge.errors(np.array([m[1] for m in models])) * judge.floor[None, :, None]

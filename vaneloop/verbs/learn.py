@@ -17,9 +17,9 @@ from vaneloop.verbs.search import diagnosed as of_chain
 
 if TYPE_CHECKING:
     from plant import Model
-    from vaneloop.identification.least_squares.problem import Fit, Judge
+    from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
     from vaneloop.identification.results import StageDiagnosis
-    from vaneloop.identification.unmodelled.fitted_candidate import Outcome, Tried
+    from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate, Outcome
     from vaneloop.identification.unmodelled.learned_law import LearnedLaw
     from vaneloop.identification.user_models.by_log import ByLog
     from vaneloop.identification.vane_chain.chain import Chain
@@ -213,9 +213,9 @@ def learned(
     """
     from vaneloop.identification.unmodelled.fitted_candidate import Outcome
     from vaneloop.identification.unmodelled.learned_law import law_of
-    from vaneloop.identification.unmodelled.learning import Learner
+    from vaneloop.identification.unmodelled.learning import CurveSearch
     from vaneloop.identification.unmodelled.parametric_substitution import spoken
-    from vaneloop.identification.vane_chain.candidates import VaneGround
+    from vaneloop.identification.vane_chain.candidates import VaneChainCandidates
 
     tell = progress or (lambda _: None)
     shape = checked_shape(shape)
@@ -233,9 +233,9 @@ def learned(
             said.append(f"{d.stage}: {'; '.join(stage.coarse.values()) if explains else driven}")
             continue
         test = next((s for s in chain.test.stages if s.name == d.stage), None) if chain.test else None
-        ground = VaneGround(stage, d.floor, test)
+        ground = VaneChainCandidates(stage, d.floor, test)
         said_by = lambda f, i=i: tell(begun + (1.0 - begun) * (i + f) / len(open_ones))  # noqa: E731
-        learner = Learner(ground, d, said_by, shape, formulas)
+        learner = CurveSearch(ground, d, said_by, shape, formulas)
         one = learner.learned()
         out = out or (one if d.verdict == "unknown" else None)
         said += [f"{d.stage}: {note}" for note in one.notes]
@@ -272,16 +272,16 @@ def learned(
 
 def _open(chain: Chain, d: StageDiagnosis) -> bool:
     """Whether a stage may lack a law that nobody listed: its error is more than noise, and no law has a name for it."""
-    from vaneloop.identification.least_squares.problem import Judge
+    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
     from vaneloop.identification.unmodelled.likelihood_acceptance import above_the_noise
 
     stage = chain.stage(d.stage)
     if stage.made is None or d.verdict == "missing":
         return False
-    return d.verdict == "unknown" or above_the_noise(Judge(stage, d.floor), d.base)
+    return d.verdict == "unknown" or above_the_noise(LeastSquaresProblem(stage, d.floor), d.base)
 
 
-def _with_stage(model: Model, judge: Judge, fit: Fit) -> Model:
+def _with_stage(model: Model, judge: LeastSquaresProblem, fit: Fit) -> Model:
     """The model with a stage's own parameters as they were fitted."""
     from vaneloop.identification.results import recalibrated
 
@@ -306,10 +306,10 @@ def _learned(
     diagnosed: Diagnosed, added: Model | None, progress: Callable[[float], None], shape: Sequence[str], formulas: bool
 ) -> Learned:
     from vaneloop.identification.results import answer_of, found_of, rms_of
-    from vaneloop.identification.unmodelled.curve_candidates import OwnGround, on_logs
+    from vaneloop.identification.unmodelled.curve_candidates import UserModelCandidates, on_logs
     from vaneloop.identification.unmodelled.learned_law import law_of
     from vaneloop.identification.unmodelled.learned_surface import LearnedSurface, surface_law_of
-    from vaneloop.identification.unmodelled.learning import Learner
+    from vaneloop.identification.unmodelled.learning import CurveSearch
     from vaneloop.identification.unmodelled.parametric_substitution import spoken
     from vaneloop.identification.unmodelled.surface_candidates import SurfaceCandidate
     from vaneloop.identification.unmodelled.surface_closed_forms import as_the_law, reach_of
@@ -317,8 +317,8 @@ def _learned(
 
     assert diagnosed.by_log is not None
     logs = diagnosed.by_log.logs
-    ground = OwnGround(logs)
-    learner = Learner(ground, diagnosed.diagnosis.stages[0], progress, shape, formulas)
+    ground = UserModelCandidates(logs)
+    learner = CurveSearch(ground, diagnosed.diagnosis.stages[0], progress, shape, formulas)
     outcome = learner.learned()
     if outcome.verdict != "learned":
         return Learned(diagnosed, outcome, [], log=diagnosed.log)
@@ -358,7 +358,7 @@ def _beside_named(
     """
     import numpy as np
 
-    from vaneloop.identification.least_squares.problem import Judge
+    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
     from vaneloop.identification.selection.relative_error_acceptance import HARM, LEAST_FALL, UNKNOWN
     from vaneloop.identification.user_models.by_log import ByLog, as_given, bind
 
@@ -372,7 +372,7 @@ def _beside_named(
         logs = bind(by.logs.fitted.system, by.logs.fitted.data.records, test, by.model)
     except StageError:  # with these laws the model does not run through its logs: what was learned alone stands
         return None
-    judge = Judge(logs.fitted.thinned, logs.fitted.floor)
+    judge = LeastSquaresProblem(logs.fitted.thinned, logs.fitted.floor)
     given = as_given(logs, judge.fit((), judge.stage.neutral(), 12))
     given.verdict = "unknown"  # what is left is more than noise
     again = replace(diagnosed, bound=logs.fitted, diagnosis=replace(diagnosed.diagnosis, stages=[given]),
@@ -396,7 +396,7 @@ def _beside_named(
     return replace(said, diagnosed=diagnosed)
 
 
-def _without(judge: Judge, fit: Fit, names: tuple[str, ...], leave: str) -> Fit | None:
+def _without(judge: LeastSquaresProblem, fit: Fit, names: tuple[str, ...], leave: str) -> Fit | None:
     """The fit with all curves but one; None where there is no other."""
     others = tuple(n for n in names if n != leave)
     if not others:
@@ -406,7 +406,7 @@ def _without(judge: Judge, fit: Fit, names: tuple[str, ...], leave: str) -> Fit 
     return judge.fit(others, theta)
 
 
-def _as_model(model: Model, outcome: Outcome, laws: list[LearnedLaw], last: Tried) -> Model:
+def _as_model(model: Model, outcome: Outcome, laws: list[LearnedLaw], last: FittedCandidate) -> Model:
     """The model with the laws as a file has them: a formula's numbers, or coefficients of B-splines.
 
     last  the model with all of them, as it was fitted

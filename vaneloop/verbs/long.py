@@ -15,7 +15,7 @@ import numpy as np
 
 from vaneloop.base.side_by_side import forks, in_processes
 from vaneloop.identification.chunked_residuals import BLOCKS, Failing, Sums, failing, joined, of_whole, sums_of
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.regimes import Located
 from vaneloop.identification.results import StageDiagnosis, rms_of, weigh
 from vaneloop.identification.selection.subsampled_search import spread
@@ -352,7 +352,7 @@ def located(
         return out, None
     fits = []
     for x in out:
-        judge = Judge(chain.stage(x.stage), x.floor)
+        judge = LeastSquaresProblem(chain.stage(x.stage), x.floor)
         fits.append((x.stage, (judge.stage.neutral(), x.fit.theta), x.floor, rms_of(judge, x.fit) ** 2))
     held = held_against(chain, fits, workers)
     for k, x in enumerate(out):

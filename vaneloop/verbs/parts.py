@@ -13,7 +13,7 @@ import numpy as np
 from vaneloop.base.errors import InputError
 from vaneloop.base.spans import Span, apart, is_span, spans_of
 from vaneloop.identification import Record, StageError, System
-from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.subsystem import Array, Stage
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def tested(chain: Any, fits: Sequence[tuple[str, Fit, Fit]]) -> list[Tested]:
         if stage is None:
             continue
         here = next(s for s in chain.stages if s.name == name)
-        judge = Judge(stage, stage.floor)
+        judge = LeastSquaresProblem(stage, stage.floor)
         thetas = np.array([carried(here, f.theta, stage) for f in (before, after)])
         if test.whole is not None:
             from vaneloop.verbs.long import held_against

@@ -394,7 +394,7 @@ def extend(
 
 def _extended(logs: Logs, name: str, effects: Sequence[str], added: Model | None) -> Extended:
     """`extend` of a system that has been held against its logs."""
-    from vaneloop.identification.selection.relative_error_acceptance import ErrorShare
+    from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance
     from vaneloop.identification.user_models.by_log import ByLog
 
     started = time.perf_counter()
@@ -404,7 +404,7 @@ def _extended(logs: Logs, name: str, effects: Sequence[str], added: Model | None
         if e not in have:
             why = "it is part of the model already" if e in bound.present else _close(e, have)
             raise InputError(f"--effect {e!r}: not a law that system {bound.system.name!r} can be given; {why}")
-    r = extend_stage(bound.thinned, tuple(dict.fromkeys(effects)), judged=ErrorShare)
+    r = extend_stage(bound.thinned, tuple(dict.fromkeys(effects)), judged=RelativeErrorAcceptance)
     by_log = ByLog.of(logs, r, added)
     d = Diagnosis("missing", [r], {}, {}, time.perf_counter() - started, by_log.notes)
     return Extended(bound, d, name, by_log, by_log.model, no_better(r) or "")

@@ -150,7 +150,7 @@ def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
 
 def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
     """Compare and locate: errors stage by stage, failure maps, curves."""
-    from vaneloop.identification.least_squares.problem import Judge
+    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
     from vaneloop.identification.workflow import locate_stages
     from vaneloop.pages.diagnosis import located_sentence, located_tone
 
@@ -158,7 +158,10 @@ def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
     progress(0.1, "comparing")
     located = locate_stages(chain.stages, lambda share, name: progress(0.1 + 0.9 * share, f"locating: {name}"))
     figures = [f for x in located for f in x.signals]
-    curves = {x.stage: curves_of(Judge(chain.stage(x.stage), x.floor), {"nominal model": x.fit.theta}) for x in located}
+    curves = {
+        x.stage: curves_of(LeastSquaresProblem(chain.stage(x.stage), x.floor), {"nominal model": x.fit.theta})
+        for x in located
+    }
     progress(1.0, "")
     return {
         "figures": figures, "located": {x.stage: x for x in located},
@@ -225,7 +228,7 @@ def diagnose(progress: Progress, words: list[str]) -> dict[str, Any]:
 
 def refit(progress: Progress, words: list[str], stage: str, effects: tuple[str, ...]) -> dict[str, Any]:
     """Fit one stage with exactly these effects, as ``vaneloop extend`` does."""
-    from vaneloop.identification.least_squares.problem import Judge
+    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
     from vaneloop.identification.workflow import extend_stage
 
     chain = chain_for(words, progress)
@@ -240,7 +243,7 @@ def refit(progress: Progress, words: list[str], stage: str, effects: tuple[str, 
 
     tick()
     r = extend_stage(s, effects, tick)
-    judge = Judge(s, r.floor)
+    judge = LeastSquaresProblem(s, r.floor)
     models = {"nominal model": r.base.theta}
     if effects:
         models["with effects"] = r.final.theta
@@ -255,11 +258,11 @@ def hand(
     """
     import numpy as np
 
-    from vaneloop.identification.least_squares.problem import Judge
+    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 
     chain = chain_for(words, progress)
     s = chain.stage(stage)
-    judge = Judge(s, np.asarray(floor))
+    judge = LeastSquaresProblem(s, np.asarray(floor))
     by_hand = np.array(theta, dtype=float)
     for effect, given in values.items():
         at = s.index()[effect].start

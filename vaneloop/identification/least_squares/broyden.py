@@ -16,7 +16,7 @@ import numpy as np
 
 from vaneloop.identification.subsystem import Array
 
-__all__ = ["NOT_KNOWN", "Carried", "Known", "LatestSlopes", "bounded_step"]
+__all__ = ["NOT_KNOWN", "BroydenJacobian", "Known", "LatestSlopes", "bounded_step"]
 
 VALUES = 2_000_000  # of slopes that are kept, 16 MB
 
@@ -35,7 +35,7 @@ class Known(NamedTuple):
 NOT_KNOWN = Known(np.zeros(0, dtype=int), np.zeros((0, 0)))
 
 
-class Carried:
+class BroydenJacobian:
     """Errors and minus their slopes at one place of a descent; their gradient and normal matrix.
 
     error   whitened, float64[outputs, samples]

@@ -1,6 +1,6 @@
 """The steps of a fit: Levenberg-Marquardt with bounds, three dampings at a time.
 
-Slopes are simulated, a parameter set for each free parameter, or carried on from the last step
+Linearisation are simulated, a parameter set for each free parameter, or carried on from the last step
 (`identification.least_squares.broyden`). A step by carried slopes costs the three trials alone. They are simulated anew
 where such a step brings much less than they promised, or less for its cost than the last step by simulated ones; and a
 descent does not end before simulated slopes say so.
@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Carried, Known, bounded_step
+from vaneloop.identification.least_squares.broyden import NOT_KNOWN, BroydenJacobian, Known, bounded_step
 from vaneloop.identification.subsystem import Array
 
 if TYPE_CHECKING:
-    from vaneloop.identification.least_squares.problem import Judge
+    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 
-__all__ = ["EVIDENCE", "STILL", "Begin", "End", "carries", "descent"]
+__all__ = ["EVIDENCE", "STILL", "Begin", "End", "carries", "levenberg_marquardt"]
 
 # Independent observations of an output that a log is worth at most: the model's equations are not nature's, and an
 # error of form does not average out however long the log. Set on logs of the rig, so that intervals cover the truth as
@@ -69,13 +69,15 @@ class End(NamedTuple):
     near: Known
 
 
-def carries(judge: Judge, free: Array) -> bool:
+def carries(judge: LeastSquaresProblem, free: Array) -> bool:
     """Whether slopes by these columns are carried along: a stage may not want that, and they may be too many."""
     return judge.stage.carries and len(free) * judge.measured.size <= CARRIED
 
 
-def descent(judge: Judge, free: Array, begin: Begin, iterations: int) -> Generator[Array, Array, End]:
-    """The steps of a `identification.least_squares.problem.Judge.fitting` in these columns."""
+def levenberg_marquardt(
+    judge: LeastSquaresProblem, free: Array, begin: Begin, iterations: int
+) -> Generator[Array, Array, End]:
+    """The steps of a `identification.least_squares.problem.LeastSquaresProblem.fitting` in these columns."""
     low, high = judge.bounds()
     theta, linear, weights = judge.wrapped(np.clip(begin.theta, low, high)), begin.linear, begin.weights
     expected, prior, scale = judge.stage.expected(), judge._prior[free], judge.scale[free]
@@ -85,14 +87,14 @@ def descent(judge: Judge, free: Array, begin: Begin, iterations: int) -> Generat
         return cost @ block_weights + np.sum(prior * (thetas[:, free] - expected[free]) ** 2, axis=1)
 
     may_carry = weights is None and carries(judge, free)
-    carried = Carried(*begin.slopes) if begin.slopes is not None and may_carry else None
+    carried = BroydenJacobian(*begin.slopes) if begin.slopes is not None and may_carry else None
     fresh = True  # whether the next step goes by slopes that are simulated
     damping, stalled, here, lately = 1e-3, False, np.inf, 0.0
     known: Array | None = None  # errors at theta
     if linear is None and may_carry and iterations and begin.near.fits(judge.measured.size):
         asked, all_slopes = judge._begun(theta, free, begin.near)
         known, slopes = all_slopes((yield asked))
-        carried, fresh = Carried(known, slopes), False
+        carried, fresh = BroydenJacobian(known, slopes), False
         here = float(total(judge.block_costs(known[None]), theta[None])[0])
     left, carried_step = float(iterations), max(STEP, len(DAMPED) / (len(DAMPED) + max(len(free), 1)))
     first = ahead = True  # whether no step was made; whether the last was made by simulated slopes
@@ -102,7 +104,7 @@ def descent(judge: Judge, free: Array, begin: Begin, iterations: int) -> Generat
             asked, derivative = judge._differences(theta, free, scale, high, known)
             error, slopes = derivative((yield asked))
             linear = judge._blocks(error, slopes)
-            carried = Carried(error, slopes) if may_carry else None
+            carried = BroydenJacobian(error, slopes) if may_carry else None
         if linear is not None:
             here = float(total(linear[0][None], theta[None])[0])
             a, g = np.tensordot(block_weights, linear[2], 1), block_weights @ linear[1]

@@ -19,11 +19,18 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known, LatestSlopes
-from vaneloop.identification.least_squares.levenberg_marquardt import EVIDENCE, STILL, Begin, End, carries, descent
-from vaneloop.identification.least_squares.residuals import Latest, whiten
+from vaneloop.identification.least_squares.levenberg_marquardt import (
+    EVIDENCE,
+    STILL,
+    Begin,
+    End,
+    carries,
+    levenberg_marquardt,
+)
+from vaneloop.identification.least_squares.residuals import ResidualCache, normalise_residuals
 from vaneloop.identification.subsystem import Array, Stage, StageError
 
-__all__ = ["Fit", "Judge", "Task", "covariance", "finished", "recalibrate"]
+__all__ = ["Fit", "LeastSquaresProblem", "Task", "covariance", "finished", "recalibrate"]
 
 Answer = TypeVar("Answer")
 Task = Generator[
@@ -76,14 +83,14 @@ class Led(NamedTuple):
     slopes: Known
 
 
-class Judge:
+class LeastSquaresProblem:
     """Everything that fits of one stage share: whitening, windows, blocks, base fit."""
 
     def __init__(self, stage: Stage, floor: Array, keep: Array | None = None):
         """Prepare ``stage`` with noise ``floor`` (one per output); ``keep``: samples that count (default: all measured
         ones).
         """
-        self.stage, self.floor, self._latest, self.keep = stage, np.asarray(floor, dtype=float), Latest(), keep
+        self.stage, self.floor, self._latest, self.keep = stage, np.asarray(floor, dtype=float), ResidualCache(), keep
         self._near = LatestSlopes()
         self.spared: set[int] = set()  # columns of nominal parameters that stay where they are
         self.roughly = False  # a fit that leaves more than noise ends when it gains less than `EVIDENCE` can tell
@@ -165,7 +172,7 @@ class Judge:
         """Whitened errors of the outputs ``model``, [sets, outputs, samples]."""
         out = np.empty(np.shape(model)) if out is None else out
         starts = self.window_start if self.window_start is not None else np.empty(0, dtype=np.int64)
-        whiten(np.ascontiguousarray(model, float), self.measured, self._counted, self.floor, starts, out)
+        normalise_residuals(np.ascontiguousarray(model, float), self.measured, self._counted, self.floor, starts, out)
         return out
 
     def block_costs(self, e: Array) -> Array:
@@ -286,12 +293,12 @@ class Judge:
         """The steps of a `fitting`."""
         free = self.columns(effects)
         if not isinstance(start, Fit):
-            return (yield from descent(self, free, Begin(start, None, None, slopes, weights), iterations))
+            return (yield from levenberg_marquardt(self, free, Begin(start, None, None, slopes, weights), iterations))
         begin = Begin(start.theta, None, None, slopes, weights)
         if start.effects == effects and np.array_equal(start.free, free):
             at_start = start.near.get(start.theta, free) if start.near is not None else None
             begin = begin._replace(linear=(start.cost, start.gradients, start.normals), slopes=at_start)
-        return (yield from descent(self, free, begin, iterations))
+        return (yield from levenberg_marquardt(self, free, begin, iterations))
 
     def _blocks(self, e: Array, jac: Array) -> tuple[Array, Array, Array]:
         """Sum of squares, gradient and normal matrix of every block, from the error and its derivatives
@@ -471,7 +478,7 @@ def _apart(one: Moves, other: Moves) -> bool:
     return any(None not in (a, b) and a != b for a, b in zip(one, other, strict=True))
 
 
-def finished(judge: Judge, task: Task[Fit], go_on: bool = True) -> Task[Fit]:
+def finished(judge: LeastSquaresProblem, task: Task[Fit], go_on: bool = True) -> Task[Fit]:
     """The fit, gone on with until its error falls no more."""
     fit = yield from task
     for _ in range(4 if go_on else 0):
@@ -484,7 +491,7 @@ def finished(judge: Judge, task: Task[Fit], go_on: bool = True) -> Task[Fit]:
     return fit
 
 
-def recalibrate(judge: Judge) -> Fit:
+def recalibrate(judge: LeastSquaresProblem) -> Fit:
     """The stage with nothing added, its nominal parameters refitted within their tolerances, from wherever the stage
     says that a fit may begin: what every verb starts from.
 

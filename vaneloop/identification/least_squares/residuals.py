@@ -12,13 +12,13 @@ import numpy as np
 from vaneloop.base.compiled import compiled_free
 from vaneloop.identification.subsystem import Array
 
-__all__ = ["FAR", "Latest", "whiten"]
+__all__ = ["FAR", "ResidualCache", "normalise_residuals"]
 
 FAR = 1e6  # noise floors: the error of a sample of which the model says nothing; no fit ends there
 
 
 @compiled_free
-def whiten(
+def normalise_residuals(
     model: np.ndarray, measured: np.ndarray, counted: np.ndarray, floor: np.ndarray, starts: np.ndarray, out: np.ndarray
 ) -> None:
     """Fill out[set, output, sample] with (measured - model) / floor, less its mean over each window.
@@ -52,7 +52,7 @@ def whiten(
 VALUES = 4_000_000  # that are kept, 32 MB
 
 
-class Latest:
+class ResidualCache:
     """What was simulated last, by its parameters, bit for bit."""
 
     def __init__(self) -> None:

@@ -1,7 +1,8 @@
 """Which effects is a stage missing? Screening, pairs of the leaders, pruning, rivals, and what is left.
 
 The fits are those of `identification.selection.search`. What earns an effect its place is for the criterion to say:
-`NoiseFloor` for a model that may come down to the noise of its log, `ErrorShare` for one that will not.
+`LikelihoodAcceptance` for a model that may come down to the noise of its log, `RelativeErrorAcceptance` for one that
+will not.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ from functools import partial
 
 import numpy as np
 
-from vaneloop.identification.least_squares.problem import Fit, Judge, recalibrate
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
 from vaneloop.identification.results import Candidate, StageDiagnosis, answer_of, found_of, parameters_of, rms_of
-from vaneloop.identification.selection.likelihood_acceptance import TOLERATED, NoiseFloor
+from vaneloop.identification.selection.likelihood_acceptance import TOLERATED, LikelihoodAcceptance
 from vaneloop.identification.selection.search import Criterion, Search
 from vaneloop.identification.selection.subsampled_search import excerpt_of, searched
 from vaneloop.identification.subsystem import Array, Stage, StageError, noise_of, reach_of
@@ -27,7 +28,7 @@ SEARCHED = 40_000  # samples of an excerpt, about
 PIECE = 4_000  # samples in a row: longer than the memory of any stage here
 WAYS = 2  # leading effects from which else pairs are tried, where those found leave more than noise
 
-Judged = Callable[[Judge], Criterion]  # makes the criterion of a stage
+Judged = Callable[[LeastSquaresProblem], Criterion]  # makes the criterion of a stage
 Said = tuple[Search, Fit, list[Candidate], list[tuple[str, float]]]
 
 
@@ -43,7 +44,7 @@ def diagnose_stage(
     floor: Array,
     keep: Array | None = None,
     tick: Callable[[], None] | None = None,
-    judged: Judged = NoiseFloor,
+    judged: Judged = LikelihoodAcceptance,
 ) -> StageDiagnosis:
     """Search the stage's library for what is missing; see `_search`.
 
@@ -58,9 +59,9 @@ def diagnose_stage(
     """
     if stage.excerpt is None or len(stage.t) < LONG:
         return _unless_coarse(stage, _to_the_floor(stage, floor, keep, tick, judged))
-    judge = Judge(stage, floor, keep)
+    judge = LeastSquaresProblem(stage, floor, keep)
     at = excerpt_of(judge, None, PIECE, SEARCHED)
-    even = Judge(stage.excerpt(at), floor, None if keep is None else keep[..., at])
+    even = LeastSquaresProblem(stage.excerpt(at), floor, None if keep is None else keep[..., at])
     base = judge.fit((), recalibrate(even).theta)  # from near it, where few steps are left
     left = base
     for _ in range(2):
@@ -86,7 +87,7 @@ def _confirm(
     stage: Stage, keep: Array | None, floor: Array, base: Fit, said: StageDiagnosis, judged: Judged
 ) -> StageDiagnosis:
     """Fit what an excerpt said to the whole log; an effect that the whole log does not need is dropped."""
-    judge = Judge(stage, said.floor, keep)
+    judge = LeastSquaresProblem(stage, said.floor, keep)
     criterion = judged(judge)
     nominal = base if np.array_equal(floor, said.floor) else judge.fit((), base.theta, 4)
     chosen, current = said.final.effects, nominal
@@ -146,8 +147,8 @@ def _to_the_floor(
     """Search down to the floor, name what was found, and conclude."""
 
     def ask(floor: Array, last: bool) -> tuple[Fit, Said]:
-        judge = Judge(stage, floor, keep)
-        begun: Judged = partial(NoiseFloor, known=TOLERATED - 1.0) if last else judged
+        judge = LeastSquaresProblem(stage, floor, keep)
+        begun: Judged = partial(LikelihoodAcceptance, known=TOLERATED - 1.0) if last else judged
         said = _search(searched(begun(judge), begun, tick))
         return said[1], said
 
@@ -255,7 +256,10 @@ def _on_another_way(search: Search, current: Fit, singles: dict[str, Fit]) -> Fi
 
 
 def extend_stage(
-    stage: Stage, effects: tuple[str, ...], tick: Callable[[], None] | None = None, judged: Judged = NoiseFloor
+    stage: Stage,
+    effects: tuple[str, ...],
+    tick: Callable[[], None] | None = None,
+    judged: Judged = LikelihoodAcceptance,
 ) -> StageDiagnosis:
     """Fit a stage with exactly these effects, one added after the other; ``tick`` is called after each fit.
 
@@ -270,7 +274,7 @@ def extend_stage(
             )
 
     def ask(floor: Array, _: bool) -> tuple[Fit, Said]:
-        judge = Judge(stage, floor)
+        judge = LeastSquaresProblem(stage, floor)
         search = Search(judged(judge), tick)
         search.singles(effects)
         order: tuple[str, ...] = ()

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import (
     Candidate,
     Found,
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from vaneloop.identification.selection.search import Search
 
 __all__ = [
-    "EXPLAINED", "NATS", "RIVAL_SPREADS", "NoiseFloor", "as_close", "correlation_of", "gain", "leaves_too_much",
-    "significant", "with_rivals",
+    "EXPLAINED", "NATS", "RIVAL_SPREADS", "LikelihoodAcceptance", "as_close", "correlation_of", "gain",
+    "leaves_too_much", "significant", "with_rivals",
 ]  # fmt: skip
 
 NATS = 12.0  # gain that the best of a library of useless effects reaches in fewer than 1 of 100 clean logs, with margin
@@ -59,7 +59,7 @@ LEFT_FLOORS = 3.0
 BOUND = "fits only at the end of its physical range"
 
 
-def correlation_of(judge: Judge, fit: Fit) -> float:
+def correlation_of(judge: LeastSquaresProblem, fit: Fit) -> float:
     """Return how many samples of the fit's error count as one observation, at most 50.
 
     Variance inflation of a sum of the squared errors: 1 + 2 sum of the squared autocorrelations up to the first that is
@@ -83,7 +83,7 @@ def correlation_of(judge: Judge, fit: Fit) -> float:
     return min(worst, 50.0)
 
 
-def gain(judge: Judge, before: Fit, after: Fit, correlation: float) -> tuple[float, float]:
+def gain(judge: LeastSquaresProblem, before: Fit, after: Fit, correlation: float) -> tuple[float, float]:
     """Return (nats, spreads): what ``after`` gains over ``before`` on held-out blocks."""
     d = before.held_out - after.held_out
     nats = 0.5 * float(d.sum()) / correlation
@@ -98,7 +98,7 @@ def gain(judge: Judge, before: Fit, after: Fit, correlation: float) -> tuple[flo
     return nats, max(float(overall), SPREADS / BLOCK_SPREADS * float(np.sort(local)[-2:].mean()))
 
 
-def _above_floor(judge: Judge, fit: Fit, correlation: float, known: float = FLOOR_KNOWN) -> bool:
+def _above_floor(judge: LeastSquaresProblem, fit: Fit, correlation: float, known: float = FLOOR_KNOWN) -> bool:
     """True when the held-out error is above the noise floor, over the whole log or in single blocks, by more than the
     floor's spread.
 
@@ -111,7 +111,7 @@ def _above_floor(judge: Judge, fit: Fit, correlation: float, known: float = FLOO
     return bool(whole or np.any(blocks & (m > 0.2 * m.max())))
 
 
-def significant(judge: Judge, before: Fit, after: Fit, correlation: float) -> bool:
+def significant(judge: LeastSquaresProblem, before: Fit, after: Fit, correlation: float) -> bool:
     """True when ``after`` is worth its extra effect."""
     nats, spreads = gain(judge, before, after, correlation)
     excess = before.held_out.sum() - judge.n
@@ -121,12 +121,12 @@ def significant(judge: Judge, before: Fit, after: Fit, correlation: float) -> bo
     return nats > NATS + (extra - 1) and spreads > SPREADS
 
 
-class NoiseFloor:
+class LikelihoodAcceptance:
     """The criterion (`identification.selection.search.Criterion`); ``known``: relative error of the noise floor."""
 
     most, leaders, fitted, finished, least, roams = 4, 5, 1_000_000, 3, NATS, False
 
-    def __init__(self, judge: Judge, known: float = FLOOR_KNOWN):
+    def __init__(self, judge: LeastSquaresProblem, known: float = FLOOR_KNOWN):
         self.judge, self.known = judge, known
         self.correlation = 1.0
         self.left_out: dict[str, str] = {}
@@ -222,7 +222,7 @@ class NoiseFloor:
             found.append(Found(m, shares[m], sizes, rivals, nats, tried_fits, shares, falls[m]))
             if m in judge.stage.twins:
                 cause, run = judge.stage.twins[m]
-                other = Judge(replace(judge.stage, run=run), judge.floor, judge.valid)
+                other = LeastSquaresProblem(replace(judge.stage, run=run), judge.floor, judge.valid)
                 twin = other.fit(current.effects, current.theta, 8)
                 if significant(judge, current, twin, correlation):
                     found[-1] = replace(found[-1], refused=f"would have to turn on {cause}")
@@ -285,7 +285,7 @@ def leaves_too_much(before: float, after: float, worst: float, effects: int, n: 
     return after**2 - 1.0 > LEAST_SHARE * max(before**2 - 1.0, 1e-12) or max(after, worst) > left
 
 
-def as_close(judge: Judge, d: StageDiagnosis, fit: Fit) -> bool:
+def as_close(judge: LeastSquaresProblem, d: StageDiagnosis, fit: Fit) -> bool:
     """Whether a fit comes as close to the floor as a stage's answer must."""
     return rms_of(judge, fit) <= max(TOLERATED, (1.0 + FLOOR_KNOWN) * d.excess)
 
@@ -301,7 +301,7 @@ def with_rivals(best: str, rivals: list[str], shares: dict[str, float]) -> list[
     return out
 
 
-def _widen_steps(judge: Judge, fit: Fit, name: str, correlation: float) -> None:
+def _widen_steps(judge: LeastSquaresProblem, fit: Fit, name: str, correlation: float) -> None:
     """Give an effect that acts in steps (a threshold), whose slope is zero, the interval of sizes that are as good: 90
     %, in the fit.
     """
@@ -321,7 +321,7 @@ def _widen_steps(judge: Judge, fit: Fit, name: str, correlation: float) -> None:
     fit.low[k], fit.high[k] = limits
 
 
-def _freedom(judge: Judge, fit: Fit, correlation: float) -> float:
+def _freedom(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> float:
     """How much more the fit's parameters could have been than the data let them be, in nats: 0.5 log det(data + prior)
     / det(prior).
 
@@ -346,7 +346,7 @@ def _freedom(judge: Judge, fit: Fit, correlation: float) -> float:
     return 0.5 * float(np.linalg.slogdet(data[np.ix_(used, used)] + np.diag(prior))[1] - np.log(prior).sum())
 
 
-def _worse(judge: Judge, other: Fit, best: Fit, correlation: float, freer: float) -> bool:
+def _worse(judge: LeastSquaresProblem, other: Fit, best: Fit, correlation: float, freer: float) -> bool:
     """True when the log can tell that ``other`` is not it: it explains less than ``best``, or no more though it is
     ``freer`` (nats).
     """
@@ -355,7 +355,7 @@ def _worse(judge: Judge, other: Fit, best: Fit, correlation: float, freer: float
     return less or min(nats, 0.0) + freer > RIVAL_NATS
 
 
-def rival_nats(judge: Judge, squares: float, correlation: float) -> float:
+def rival_nats(judge: LeastSquaresProblem, squares: float, correlation: float) -> float:
     """Nats by which one of two effects beats the other, where the better one leaves so many ``squares``: the more, the
     more it leaves above the noise floor, as well as that is known.
     """

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.regimes import agrees
 from vaneloop.identification.results import Candidate, Found, StageDiagnosis, answer_of, at_bound, parameters_of, rms_of
 from vaneloop.identification.subsystem import Array
@@ -34,7 +34,7 @@ from vaneloop.identification.subsystem import Array
 if TYPE_CHECKING:
     from vaneloop.identification.selection.search import Search
 
-__all__ = ["LEAST_FALL", "ErrorShare", "structure", "worth"]
+__all__ = ["LEAST_FALL", "RelativeErrorAcceptance", "structure", "worth"]
 
 LEAST_FALL = 0.20  # share of the held-out sum of squares beyond noise that an effect must explain
 LEAST_OF_NOISE = 0.10  # and share of the noise (5 % of its RMS)
@@ -75,14 +75,14 @@ class Evidence:
         return self.fall >= self.least and self.help >= LEAST_HELP and self.agree >= 2
 
 
-def _levels(judge: Judge, fit: Fit, least: float = 1.0) -> tuple[Array, Array]:
+def _levels(judge: LeastSquaresProblem, fit: Fit, least: float = 1.0) -> tuple[Array, Array]:
     """Held-out sum of squares of every block, not below ``least`` (noise floors, RMS), and the number of samples."""
     use = judge.samples > 0
     m = judge.samples[use].astype(float)
     return np.maximum(fit.held_out[use], m * least * least), m
 
 
-def worth(judge: Judge, before: Fit, after: Fit, form: float = 0.0) -> Evidence:
+def worth(judge: LeastSquaresProblem, before: Fit, after: Fit, form: float = 0.0) -> Evidence:
     """Evidence for ``after`` against ``before``.
 
     form  error (noise floors) by which the equations of what is in the model already may be wrong
@@ -98,7 +98,7 @@ def worth(judge: Judge, before: Fit, after: Fit, form: float = 0.0) -> Evidence:
     return Evidence(fall, helps, int(np.sum(r > AGREE)), least)
 
 
-def score(judge: Judge, fit: Fit, blocks: Array | None = None) -> float:
+def score(judge: LeastSquaresProblem, fit: Fit, blocks: Array | None = None) -> float:
     """Log of the held-out error, half over all samples, half over the blocks; less is better. ``blocks``: a resampling
     of them. Near a noise that is known: of the error itself, in its stage's ``grain``.
     """
@@ -113,7 +113,7 @@ def score(judge: Judge, fit: Fit, blocks: Array | None = None) -> float:
     )
 
 
-class ErrorShare:
+class RelativeErrorAcceptance:
     """The criterion (`identification.selection.search.Criterion`).
 
     figures  function from parameters to the log of the RMS error on each log, fitted or not
@@ -122,7 +122,7 @@ class ErrorShare:
 
     most, leaders, fitted, finished, least, roams = 6, 4, 8, 3, 0.0, True
 
-    def __init__(self, judge: Judge, figures: Figures | None = None, tests: frozenset[str] = frozenset()):
+    def __init__(self, judge: LeastSquaresProblem, figures: Figures | None = None, tests: frozenset[str] = frozenset()):
         self.judge, self.figures, self.tests = judge, figures, tests
         self.form = 0.0
         self.notes: list[str] = []
@@ -330,7 +330,7 @@ class ErrorShare:
         return out
 
 
-def structure(judge: Judge, fit: Fit) -> float:
+def structure(judge: LeastSquaresProblem, fit: Fit) -> float:
     """Share of the remaining error that present and past inputs and outputs predict on blocks that the prediction was
     not fitted to.
 

@@ -11,25 +11,32 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.subsystem import Array, Effect, Stage
 
-__all__ = ["LINE", "Slopes", "along", "followed", "out_of", "within"]
+__all__ = ["LINE", "Linearisation", "along", "followed", "out_of", "within"]
 
 LINE = (0.02, 5.0)  # times the size tried, within which a better size is looked for
 TOGETHER = 16  # sets whose slopes are simulated at one time
 SAME = (0.8, 1.25)  # times a size that count as that size
 
 
-class Slopes:
-    """Errors of a fit (``error``), and their slopes by its free parameters (``jac``), whitened as `Judge.linearise` has
-    them.
+class Linearisation:
+    """Errors of a fit (``error``), and their slopes by its free parameters (``jac``), whitened as
+    `LeastSquaresProblem.linearise` has them.
 
     prior  of the free parameters, as a fit has it
     known  error and slopes, where they are
     """
 
-    def __init__(self, judge: Judge, theta: Array, free: Array, prior: Array, known: tuple[Array, Array] | None = None):
+    def __init__(
+        self,
+        judge: LeastSquaresProblem,
+        theta: Array,
+        free: Array,
+        prior: Array,
+        known: tuple[Array, Array] | None = None,
+    ):
         """Simulate the fit and its difference steps, where they are not known."""
         self.error, self.jac = known if known is not None else judge.linearise(theta, free)
         self._flat = self.jac.reshape(len(free), self.error.size)
@@ -133,7 +140,7 @@ def _solved(a: Array, b: Array) -> Array:
         return np.asarray(np.linalg.lstsq(a, b)[0])
 
 
-def followed(judge: Judge, thetas: list[Array], free: Array, prior: Array) -> tuple[Array, list[float]]:
+def followed(judge: LeastSquaresProblem, thetas: list[Array], free: Array, prior: Array) -> tuple[Array, list[float]]:
     """Errors at each set of parameters, and what is left when the free ones have followed by the slopes that they have
     *there*; the sets are moved there. For a parameter in which the outputs are linear (a gain, an offset) that is exact
     however far it has to go.
@@ -145,7 +152,7 @@ def followed(judge: Judge, thetas: list[Array], free: Array, prior: Array) -> tu
         all_errors = judge.errors(np.concatenate([asked for asked, _ in batch]))
         at = 0
         for k, (asked, derivative) in enumerate(batch, i):
-            slopes = Slopes(judge, thetas[k], free, prior, derivative(all_errors[at : at + len(asked)]))
+            slopes = Linearisation(judge, thetas[k], free, prior, derivative(all_errors[at : at + len(asked)]))
             at += len(asked)
             step, left = slopes._follow(slopes.error)
             thetas[k] = thetas[k].copy()

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from vaneloop.identification.least_squares.broyden import NOT_KNOWN, bounded_step
-from vaneloop.identification.least_squares.problem import Fit, Judge, Led, Task, finished, recalibrate
-from vaneloop.identification.selection.screening import Slopes, along, followed, onward, out_of, within
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, Led, Task, finished, recalibrate
+from vaneloop.identification.selection.screening import Linearisation, along, followed, onward, out_of, within
 from vaneloop.identification.subsystem import Array, Effect
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class Criterion(Protocol):
     roams    the model's own parameters are known roughly: they are refitted at each start of an effect
     """
 
-    judge: Judge
+    judge: LeastSquaresProblem
     most: int
     leaders: int
     fitted: int
@@ -96,7 +96,7 @@ class Search:
         self.passed: set[frozenset[str]] = set()  # what the screening left out
         # of fits: effect that could be added -> what the best of its starts would leave, and that start
         self.promises: dict[frozenset[str], dict[str, tuple[float, Array]]] = {}
-        self.sloped: dict[frozenset[str], tuple[Fit, Slopes]] = {}
+        self.sloped: dict[frozenset[str], tuple[Fit, Linearisation]] = {}
         self.led: dict[tuple[frozenset[str], str], Fit] = {}  # sets, and an effect held there: the fit gone on from
         begins = [self.stage.neutral()]
         if self.stage.begins is not None:
@@ -126,7 +126,7 @@ class Search:
         costs: list[float] = []
         base_cost, plain = 0.0, 0
         for k, nominal in enumerate(self.nominal if roams else self.nominal[:1]):
-            slopes = Slopes(judge, nominal, self.base.free, self.base.prior)
+            slopes = Linearisation(judge, nominal, self.base.free, self.base.prior)
             first = len(thetas)
             for e in stage.effects:
                 for s in e.starts[-2:] if self.quiet else e.starts:
@@ -163,7 +163,7 @@ class Search:
         return out
 
     def _tried(
-        self, slopes: Slopes, theta: Array, thetas: list[Array], owner: list[str]
+        self, slopes: Linearisation, theta: Array, thetas: list[Array], owner: list[str]
     ) -> tuple[list[float], dict[str, tuple[float, Array]]]:
         """What is left at each of these sets, which differ from ``theta`` by the effect ``owner``, once what is fitted
         there has followed (of a quick model it has, in ``thetas``); and of a model that roams, for each effect a set
@@ -207,7 +207,8 @@ class Search:
         Size and direction are polar coordinates: from a wrong direction the way is long. In a fixed direction the sizes
         act linearly near neutral, so that their best values follow from one simulation.
 
-        e0, jac  error of the fitted nominal model, and its derivatives by the nominal parameters, of `Judge.linearise`
+        e0, jac  error of the fitted nominal model, and its derivatives by the nominal parameters, of
+                 `LeastSquaresProblem.linearise`
         """
         judge, at = self.judge, self.stage.index()[effect.name]
         turning = [i for i, p in enumerate(effect.parameters) if p.period]
@@ -430,11 +431,11 @@ class Search:
             return np.inf
         return slopes.left(errors)[0]
 
-    def _slopes(self, key: frozenset[str]) -> Slopes:
+    def _slopes(self, key: frozenset[str]) -> Linearisation:
         """The slopes of a fit that is known."""
         fit = self.fits[key]
         if key not in self.sloped or self.sloped[key][0] is not fit:
-            self.sloped[key] = fit, Slopes(self.judge, fit.theta, fit.free, fit.prior)
+            self.sloped[key] = fit, Linearisation(self.judge, fit.theta, fit.free, fit.prior)
         return self.sloped[key][1]
 
     def _joined(self, effects: tuple[str, ...], finished: bool) -> Task[Fit]:

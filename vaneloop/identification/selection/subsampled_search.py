@@ -13,12 +13,12 @@ from functools import cached_property
 
 import numpy as np
 
-from vaneloop.identification.least_squares.problem import Fit, Judge, Task
-from vaneloop.identification.selection.likelihood_acceptance import NATS, NoiseFloor, rival_nats
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, Task
+from vaneloop.identification.selection.likelihood_acceptance import NATS, LikelihoodAcceptance, rival_nats
 from vaneloop.identification.selection.search import DIRECTIONS, SCREENED, Criterion, Search
 from vaneloop.identification.subsystem import Array, Effect, Stage
 
-__all__ = ["Scouted", "excerpt_of", "searched", "spread"]
+__all__ = ["SubsampledSearch", "excerpt_of", "searched", "spread"]
 
 AHEAD = 8_000  # samples of the excerpt, about
 LITTLE = 0.5  # of what counts in the best piece: a piece with less tells little
@@ -28,12 +28,14 @@ LEAST = 0.5  # share of what an effect must gain (`NATS`) that it must promise, 
 Promise = tuple[float, Array]  # sum of squares, parameters
 
 
-def searched(criterion: Criterion, judged: Callable[[Judge], Criterion], tick: Callable[[], None] | None) -> Search:
+def searched(
+    criterion: Criterion, judged: Callable[[LeastSquaresProblem], Criterion], tick: Callable[[], None] | None
+) -> Search:
     """The search of a stage: with one ahead, where the stage is long enough."""
     stage = criterion.judge.stage
-    if stage.excerpt is None or len(stage.t) < 2 * AHEAD or not isinstance(criterion, NoiseFloor):
+    if stage.excerpt is None or len(stage.t) < 2 * AHEAD or not isinstance(criterion, LikelihoodAcceptance):
         return Search(criterion, tick)
-    return Scouted(criterion, judged, tick)
+    return SubsampledSearch(criterion, judged, tick)
 
 
 class _Ahead(Search):
@@ -71,15 +73,20 @@ class _Ahead(Search):
         return self.fits[key]
 
 
-class Scouted(Search):
+class SubsampledSearch(Search):
     """The search on one stage, with a search on an excerpt of it ahead.
 
     judged  makes the criterion of the excerpt
     """
 
-    criterion: NoiseFloor
+    criterion: LikelihoodAcceptance
 
-    def __init__(self, criterion: NoiseFloor, judged: Callable[[Judge], Criterion], tick: Callable[[], None] | None):
+    def __init__(
+        self,
+        criterion: LikelihoodAcceptance,
+        judged: Callable[[LeastSquaresProblem], Criterion],
+        tick: Callable[[], None] | None,
+    ):
         """Fit the model as it is, and see what each effect could do for it."""
         self._promised: dict[frozenset[str], dict[str, Promise]] = {}
         super().__init__(criterion, tick)
@@ -139,7 +146,7 @@ class Scouted(Search):
         judge = self.judge
         assert self.stage.excerpt is not None
         at = excerpt_of(judge, self.base, PIECE, AHEAD)
-        part = Judge(self.stage.excerpt(at), judge.floor, judge.valid[:, at])
+        part = LeastSquaresProblem(self.stage.excerpt(at), judge.floor, judge.valid[:, at])
         part.roughly = True
         return _Ahead(self._judged(part), self.tick, self.starts)
 
@@ -201,7 +208,7 @@ class Scouted(Search):
         near = [f for f in rough if total(f) <= self._near(self.judge, total(rough[0]), self.criterion.correlation)]
         return self.judge.together([self._from(f) for f in near[:most]])
 
-    def _near(self, judge: Judge, best: float, correlation: float) -> float:
+    def _near(self, judge: LeastSquaresProblem, best: float, correlation: float) -> float:
         """The sum of squares up to which a fit may turn out to do as well as the one that leaves ``best``: four times
         what rivals may have between them.
         """
@@ -274,7 +281,7 @@ def _tried(effect: Effect) -> list[tuple[float, ...]]:
     return starts
 
 
-def excerpt_of(judge: Judge, fit: Fit | None, piece: int, searched: int) -> Array:
+def excerpt_of(judge: LeastSquaresProblem, fit: Fit | None, piece: int, searched: int) -> Array:
     """Samples to search on, about ``searched``: pieces of whole windows, about ``piece`` long, half of them evenly
     spaced, the others where ``fit`` fails most; without a fit the first half only. Pieces of which little counts tell
     little, such as those of a linkage that stands.

@@ -11,13 +11,18 @@ from vaneloop.base.curve import FINE, POINTS
 from vaneloop.base.forms import FORMS, Form
 from vaneloop.base.side_by_side import side_by_side
 from vaneloop.identification.candidates.closed_forms import Formula, begin, text_of, values_of
-from vaneloop.identification.least_squares.problem import Judge, covariance
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem, covariance
 from vaneloop.identification.regimes import agrees
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.selection.relative_error_acceptance import FORM, score
 from vaneloop.identification.subsystem import Array, Effect, Parameter
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
-from vaneloop.identification.unmodelled.fitted_candidate import Ground, Tried, at_samples, with_held_out
+from vaneloop.identification.unmodelled.fitted_candidate import (
+    CandidateSource,
+    FittedCandidate,
+    at_samples,
+    with_held_out,
+)
 from vaneloop.identification.user_models.simulation import Placed
 from vaneloop.identification.user_models.terms import runs
 
@@ -38,7 +43,7 @@ STEEPER = 10.0  # times the steepest slope where the logs have been: beyond, a f
 PER_NUMBER = 0.005  # log error that a number of a formula costs
 
 
-def _visited(tried: Tried) -> Array:
+def _visited(tried: FittedCandidate) -> Array:
     """Values of a curve's quantity, as often as the samples that are judged have them."""
     q, counted = tried.candidate.quantity.visited, tried.judge.valid.any(axis=0)
     judged = at_samples(q, len(counted))
@@ -46,7 +51,7 @@ def _visited(tried: Tried) -> Array:
     return np.quantile(x, np.linspace(0.005, 0.995, POINTS))
 
 
-def _variance(tried: Tried, visited: Array) -> Array:
+def _variance(tried: FittedCandidate, visited: Array) -> Array:
     """Variance of a curve at values of its quantity, by the noise of what it was fitted to."""
     c, judge, fit = tried.candidate, tried.judge, tried.fit
     scale, own = judge.scale[fit.free], judge.stage.index()[c.name]
@@ -57,7 +62,9 @@ def _variance(tried: Tried, visited: Array) -> Array:
     return np.asarray(np.maximum(np.einsum("in,ij,jn->n", rows, known, rows), 0.0))
 
 
-def fitted_formulas(ground: Ground, tried: Tried, loose: bool = False) -> list[tuple[Formula, Tried]]:
+def fitted_formulas(
+    ground: CandidateSource, tried: FittedCandidate, loose: bool = False
+) -> list[tuple[Formula, FittedCandidate]]:
     """The formulas that come nearest to a curve, each fitted in the simulation in its place; best first.
 
     A curve is known where the log tells it. Splines that leave more than noise are off by their smoothness, too, most
@@ -109,7 +116,7 @@ def _nearest(
     return [(form, numbers) for _, form, numbers in shaped]
 
 
-def likely(tried: Tried, fitted: list[tuple[Formula, Tried]], before: float) -> list[Formula]:
+def likely(tried: FittedCandidate, fitted: list[tuple[Formula, FittedCandidate]], before: float) -> list[Formula]:
     """Of formulas that were fitted those that come within `NEAR` of the best, simplest first.
 
     before  held-out error without the curve, in noise floors: no law's form is known better than `FORM` of it
@@ -143,7 +150,7 @@ def _is_shaped(form: Form, numbers: Array, c: Candidate) -> bool:
     )
 
 
-def goes_on(ground: Ground, c: Candidate, form: Form, numbers: Array) -> tuple[float, float]:
+def goes_on(ground: CandidateSource, c: Candidate, form: Form, numbers: Array) -> tuple[float, float]:
     """From where to where a formula stands in a curve's place: beyond the curve's range as far as the ground lets it,
     while it is not much steeper than within.
     """
@@ -167,7 +174,9 @@ def effect_of(name: str, names: Sequence[str], numbers: Array) -> Effect:
     return Effect(name, ps, (tuple(float(v) for v in numbers),))
 
 
-def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> tuple[Formula, Tried] | None:
+def _in_simulation(
+    ground: CandidateSource, tried: FittedCandidate, form: Form, numbers: Array
+) -> tuple[Formula, FittedCandidate] | None:
     """A formula in the curve's place, fitted with the model's own parameters.
 
     Its first number is fitted as the RMS of the whole formula where the logs have been: the height of a limit is known
@@ -200,7 +209,7 @@ def _in_simulation(ground: Ground, tried: Tried, form: Form, numbers: Array) -> 
         return c.placed_as(lambda n: table(plain(n)) - mean(plain(n)), len(numbers), (low, high), jumps)
 
     curves = (*tried.curves[:-1], (placed(*reach), effect))
-    judge = Judge(ground.stage((), curves), ground.floor, tried.settled)
+    judge = LeastSquaresProblem(ground.stage((), curves), ground.floor, tried.settled)
     judge.sparing = True
     theta = np.concatenate([tried.fit.theta[: tried.judge.stage.index()[c.name].start], numbers])
     if not np.all(np.isfinite(judge.stage.run(theta[None]))):

@@ -15,7 +15,7 @@ from vaneloop.identification.results import rms_of
 from vaneloop.identification.selection.relative_error_acceptance import HARM, LEAST_FALL, LEAST_USE, MOST_LEFT, UNKNOWN
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
-from vaneloop.identification.unmodelled.fitted_candidate import Tried, step_without
+from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate, step_without
 from vaneloop.identification.unmodelled.parametric_preference import better_than
 from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.user_models.hysteresis_regressors import swings
@@ -25,7 +25,7 @@ __all__ = ["another_confirms", "instead_of", "moves", "stands_before"]
 OTHER = 1.5  # times as large: another amplitude
 
 
-def moves(tried: Tried) -> tuple[Array, Array]:
+def moves(tried: FittedCandidate) -> tuple[Array, Array]:
     """How wide the channel that a curve remembers swings in each block, from turn to turn, also where it turns outside
     of the block; and the number of the log that the block is of.
     """
@@ -37,7 +37,7 @@ def moves(tried: Tried) -> tuple[Array, Array]:
     return np.maximum.reduceat(wide[some][:n], start), log[some][:n][start]
 
 
-def another_confirms(learner: CurveProblem, before: Tried, tried: Tried) -> bool:
+def another_confirms(learner: CurveProblem, before: FittedCandidate, tried: FittedCandidate) -> bool:
     """Whether another log, or another amplitude, says the same of a curve that remembers.
 
     Manoeuvres of one size do not hold out a hysteresis: what imitates one of them imitates all. So each log is left out
@@ -67,7 +67,7 @@ def another_confirms(learner: CurveProblem, before: Tried, tried: Tried) -> bool
     return True
 
 
-def instead_of(learner: CurveProblem, named: Tried, curves: Sequence[Tried]) -> bool:
+def instead_of(learner: CurveProblem, named: FittedCandidate, curves: Sequence[FittedCandidate]) -> bool:
     """Whether curves, of which the last stands beside the others, are taken instead of the laws with names: they must
     earn that as a second law must before the first, and be the law, or be confirmed (`stands_before`). So may a formula
     in place of either: a test log that goes further tells what splines say at their ends, and what they do not follow
@@ -85,7 +85,7 @@ def instead_of(learner: CurveProblem, named: Tried, curves: Sequence[Tried]) -> 
     return len(curves) > 1 and any(_stands(learner, named, t) for _, t in curves[0].formulas or ())
 
 
-def _stands(learner: CurveProblem, named: Tried, tried: Tried) -> bool:
+def _stands(learner: CurveProblem, named: FittedCandidate, tried: FittedCandidate) -> bool:
     if not better_than(learner, named, tried):
         return False
     was = rms_of(named.judge, named.fit)

@@ -27,7 +27,7 @@ from vaneloop.identification.user_models.simulation import Placed
 from vaneloop.identification.user_models.system import System
 from vaneloop.identification.user_models.terms import COLUMN, INPUT, OUTPUT, Curve, Jump, Table
 
-__all__ = ["Candidate", "OwnGround", "candidates", "on_logs", "with_curves"]
+__all__ = ["Candidate", "UserModelCandidates", "candidates", "on_logs", "with_curves"]
 
 
 IN_TIME = 24  # splines of a curve over time: what swings with time does so often
@@ -373,8 +373,8 @@ def on_logs(logs: Logs, curves: Sequence[tuple[Placed, Effect]], laws: Sequence[
     return Logs(with_curves(logs.fitted, laws, curves), test)
 
 
-class OwnGround:
-    """A user's own model, held against logs (`identification.unmodelled.learning.Ground`)."""
+class UserModelCandidates:
+    """A user's own model, held against logs (`identification.unmodelled.learning.CandidateSource`)."""
 
     points, jumps, surfaces = FINE, True, True
     noise_known = False

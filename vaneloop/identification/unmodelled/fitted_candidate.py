@@ -10,7 +10,7 @@ import numpy as np
 
 from vaneloop.identification.candidates.closed_forms import Formula
 from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known, bounded_step
-from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.selection.likelihood_acceptance import NATS
 from vaneloop.identification.selection.relative_error_acceptance import LEAST_FALL, LEAST_OF_NOISE
 from vaneloop.identification.subsystem import Array, Effect, Stage
@@ -23,10 +23,10 @@ from vaneloop.identification.user_models.simulation import Placed
 __all__ = [
     "MEASURED",
     "Blocks",
-    "Ground",
+    "CandidateSource",
+    "FittedCandidate",
     "Outcome",
     "Placings",
-    "Tried",
     "adds_what",
     "at_samples",
     "channel_of",
@@ -48,7 +48,7 @@ MEASURED = 2  # up to here what is `strange` is of measured or simulated channel
 LEAST_SETTLED = 0.5  # share of the samples that must be left where those that remember what was before are not counted
 
 
-class Ground(Protocol):
+class CandidateSource(Protocol):
     """What curves are learned on: one stage of a model, held against logs.
 
     whole  the stage with all laws of the library as effects; ``floor``: noise of its outputs
@@ -94,7 +94,7 @@ class Ground(Protocol):
 
 
 @dataclass(eq=False)
-class Tried:
+class FittedCandidate:
     """A curve fitted beside the model, and curves before it.
 
     curves  each as it runs and as the search has it, the new one last
@@ -108,15 +108,15 @@ class Tried:
 
     candidate: Candidate
     wiggle: float
-    judge: Judge
+    judge: LeastSquaresProblem
     fit: Fit
     curves: Placings
     told: Fit | None = None
     errors: dict[str, Array] | None = None
     rivals: Sequence[str] = ()
     rows: tuple[Array, Array] | None = None
-    formulas: list[tuple[Formula, Tried]] | None = None
-    loose: list[Tried] | None = None
+    formulas: list[tuple[Formula, FittedCandidate]] | None = None
+    loose: list[FittedCandidate] | None = None
 
     @property
     def settled(self) -> Array | None:
@@ -139,7 +139,7 @@ class Tried:
         known = known[:: max(1, round(len(known) / n))][:n]
         return None if known.all() or known.mean() < LEAST_SETTLED else known
 
-    def refitted(self, judge: Judge, fit: Fit, curves: Placings) -> Tried:
+    def refitted(self, judge: LeastSquaresProblem, fit: Fit, curves: Placings) -> FittedCandidate:
         """The same candidate as another fit has it: nothing that was worked out of this one holds of that."""
         return replace(
             self, judge=judge, fit=fit, curves=curves, told=None, errors=None, rows=None, formulas=None, loose=None
@@ -177,7 +177,7 @@ class Outcome:
     """
 
     verdict: str
-    tried: list[Tried] = field(default_factory=list)
+    tried: list[FittedCandidate] = field(default_factory=list)
     nearest: list[str] = field(default_factory=list)
     why: str = ""
     notes: list[str] = field(default_factory=list)
@@ -220,21 +220,21 @@ def channel_of(candidate: Candidate) -> str:
     return lag[0] if lag else candidate.quantity.name
 
 
-def without_its_lag(tried: Tried, late: Tried) -> bool:
+def without_its_lag(tried: FittedCandidate, late: FittedCandidate) -> bool:
     """Whether a curve is at the same place as one that remembers, of the channel behind it: it may say the same."""
     c, other = tried.candidate, late.candidate
     same = (c.how, c.at, c.quantity.name) == (other.how, other.at, channel_of(other))
     return other.quantity.remembers and same
 
 
-def one_constant(tried: Sequence[Tried]) -> list[Tried]:
+def one_constant(tried: Sequence[FittedCandidate]) -> list[FittedCandidate]:
     """Those that are ``tried``, in their order, but of those that are no more than a constant at one place only the
     plainest, in the place of the first: a constant is the same law, whatever it is called a function of. The rest of
     the log may tell more.
 
     More than a constant is what explains as much of what that leaves as a second law has to.
     """
-    flat: dict[tuple[str, str], list[Tried]] = {}
+    flat: dict[tuple[str, str], list[FittedCandidate]] = {}
     for t in tried:
         left = left_by_its_mean(t)
         known = 2.0 * NATS if t.judge.stage.grain < 1.0 else LEAST_OF_NOISE * t.judge.n
@@ -246,7 +246,7 @@ def one_constant(tried: Sequence[Tried]) -> list[Tried]:
     return [plainest.get(id(t), t) for t in tried if id(t) not in gone]
 
 
-def left_by_its_mean(tried: Tried) -> float:
+def left_by_its_mean(tried: FittedCandidate) -> float:
     """Sum of squares with only the mean of the last curve, by the slopes of its fit, the model's own parameters within
     their bounds; infinite where it has no mean.
     """
@@ -264,12 +264,12 @@ def left_by_its_mean(tried: Tried) -> float:
     return float(fit.cost.sum() - 2.0 * g @ step + step @ n @ step)
 
 
-def stands(current: Tried, candidate: Candidate) -> bool:
+def stands(current: FittedCandidate, candidate: Candidate) -> bool:
     """Whether a candidate, with just this lag or period, is one of the curves that were learned already."""
     return any(q.effect == candidate.name for q, _ in current.curves)
 
 
-def step_without(tried: Tried, held: Array) -> Array:
+def step_without(tried: FittedCandidate, held: Array) -> Array:
     """Where a fit's parameters move within their bounds, in their scales, when these blocks are left out."""
     fit, judge = tried.fit, tried.judge
     scale = judge.scale[fit.free]
@@ -333,7 +333,7 @@ def held_out(
     return np.asarray(np.maximum(out, 0.5 * cost))
 
 
-def with_held_out(judge: Judge, fit: Fit, judged: Blocks | None = None) -> Fit:
+def with_held_out(judge: LeastSquaresProblem, fit: Fit, judged: Blocks | None = None) -> Fit:
     """The fit with the held-out errors of its curves within their priors; ``judged``: of samples that count."""
     cost = (judged or (fit.cost,))[0]
     scale = judge.scale[fit.free]

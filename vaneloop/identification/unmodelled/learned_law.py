@@ -13,12 +13,12 @@ from vaneloop.base.curve import POINTS
 from vaneloop.base.durations import within_no_period
 from vaneloop.identification.candidates.closed_forms import Formula, values_of
 from vaneloop.identification.least_squares.broyden import bounded_step
-from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas, likely
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
-from vaneloop.identification.unmodelled.fitted_candidate import Ground, Tried
+from vaneloop.identification.unmodelled.fitted_candidate import CandidateSource, FittedCandidate
 from vaneloop.identification.user_models.exogenous_regressors import TIME
 from vaneloop.identification.user_models.hysteresis_regressors import STOPS, named_lag
 
@@ -143,7 +143,7 @@ def range_of(x: Array, unit: str) -> str:
     return f"[{x[0]:.4g}, {x[-1]:.4g}] {unit.strip('-')}".strip()
 
 
-def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried) -> LearnedLaw:
+def law_of(ground: CandidateSource, before: tuple[LeastSquaresProblem, Fit], tried: FittedCandidate) -> LearnedLaw:
     """Everything that is said of the last curve of ``tried``."""
     c, judge, fit = tried.candidate, tried.judge, tried.fit
     table, amplitudes = tried.table()
@@ -162,7 +162,7 @@ def law_of(ground: Ground, before: tuple[Judge, Fit], tried: Tried) -> LearnedLa
     )  # fmt: skip
 
 
-def band_of(tried: Tried, been: Array) -> tuple[Array, Array]:
+def band_of(tried: FittedCandidate, been: Array) -> tuple[Array, Array]:
     """90 % band of a curve: blocks of the log and values known beforehand drawn anew, each draw solved by the slopes of
     the fit. What the log cannot tell apart is as wide as it was known before.
 
@@ -222,7 +222,7 @@ def _with_formulas(
     return low, high
 
 
-def _trades(tried: Tried) -> list[str]:
+def _trades(tried: FittedCandidate) -> list[str]:
     """Parameters of the model that stand elsewhere than where the curve had a mean and a slope."""
     told, now = tried.told, tried.fit
     if told is None:

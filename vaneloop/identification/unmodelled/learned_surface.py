@@ -9,10 +9,10 @@ import numpy as np
 
 from plant.model import Second
 from vaneloop.base.curve import SIDE
-from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.subsystem import Array
-from vaneloop.identification.unmodelled.fitted_candidate import Tried
+from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
 from vaneloop.identification.unmodelled.learned_law import BINS, LearnedLaw, band_of, range_of
 from vaneloop.identification.unmodelled.surface_candidates import SurfaceCandidate
 from vaneloop.identification.unmodelled.surface_closed_forms import Ends, Product, likely_products
@@ -100,7 +100,7 @@ def _forms(product: Product) -> tuple[str, str]:
     return product.form, product.second_form
 
 
-def surface_law_of(before: tuple[Judge, Fit], tried: Tried) -> LearnedSurface:
+def surface_law_of(before: tuple[LeastSquaresProblem, Fit], tried: FittedCandidate) -> LearnedSurface:
     """Everything that is said of the surface that ``tried`` has last."""
     c, judge, fit = tried.candidate, tried.judge, tried.fit
     assert isinstance(c, SurfaceCandidate)

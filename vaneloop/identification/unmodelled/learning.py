@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.regimes import agrees
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.selection.relative_error_acceptance import (
@@ -32,8 +32,8 @@ from vaneloop.identification.unmodelled.confirmation import another_confirms, in
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
 from vaneloop.identification.unmodelled.fitted_candidate import (
     MEASURED,
+    FittedCandidate,
     Outcome,
-    Tried,
     adds_what,
     channel_of,
     one_constant,
@@ -60,7 +60,7 @@ from vaneloop.identification.unmodelled.surface_search import put_surface
 from vaneloop.identification.user_models.exogenous_regressors import TIME
 from vaneloop.identification.user_models.hysteresis_regressors import dissipates
 
-__all__ = ["Learner"]
+__all__ = ["CurveSearch"]
 
 MOST_CURVES = 2
 WIGGLES = (0.1, SCREENED, 5.0)  # standard deviations of a curve's first bend, in its usual size, that are tried
@@ -78,7 +78,7 @@ FORMULAS = 0.5  # log error by which a curve may be worse than the best, and a f
 SPLINES = 28  # of the best finalists where they still fail
 
 
-class Learner(CurveProblem):
+class CurveSearch(CurveProblem):
     """The search for curves on one subsystem."""
 
     def learned(self) -> Outcome:
@@ -93,7 +93,7 @@ class Learner(CurveProblem):
             out.verdict = "named"
             out.why = f"{' + '.join(self.d.final.effects)} of the library leaves nothing but noise"
             return out
-        current = Tried(self.candidates[0], 0.0, self.judge, self.base, ()) if self.candidates else None
+        current = FittedCandidate(self.candidates[0], 0.0, self.judge, self.base, ()) if self.candidates else None
         while current is not None and len(out.tried) < MOST_CURVES:
             if not self.fails(current) and (out.tried or not (unknown or self.faint)):
                 break
@@ -140,7 +140,7 @@ class Learner(CurveProblem):
         put_surface(self, out)
         return self._concluded(out, named)
 
-    def _as_learned(self, current: Tried, tried: Tried) -> tuple[Tried, str]:
+    def _as_learned(self, current: FittedCandidate, tried: FittedCandidate) -> tuple[FittedCandidate, str]:
         """A curve with the lag that suits it best, and without what parameters of the model can have; and why it is not
         learned, "" if it is: it harms a test log, and no formula that does as well is harmless.
         """
@@ -159,12 +159,12 @@ class Learner(CurveProblem):
         own = second.judge.stage.index()
         gone = {*range(own[first.candidate.name].start, own[first.candidate.name].stop)}
         theta = np.array([v for k, v in enumerate(second.fit.theta) if k not in gone])
-        nothing = Tried(second.candidate, 0.0, self.judge, self.base, ())
+        nothing = FittedCandidate(second.candidate, 0.0, self.judge, self.base, ())
         alone = self.fitted(nothing, second.candidate, second.wiggle, theta, 16)
         if self.score(alone, [alone, first]) <= self.score(second, [alone, first]) + BETTER:
             out.tried = [replace(alone, told=second.told, rivals=second.rivals)]
 
-    def _named(self) -> tuple[Judge, Fit] | None:
+    def _named(self) -> tuple[LeastSquaresProblem, Fit] | None:
         """The best laws of the library, fitted with their held-out errors, where there are any."""
         effects = self.d.final.effects or tuple(self.d.nearest[:1])
         if not effects:
@@ -180,7 +180,7 @@ class Learner(CurveProblem):
                 theta[part[e]] = self.ground.whole.effect(e).starts[0]
         return judge, judge.fit(effects, theta, 8)
 
-    def _concluded(self, out: Outcome, named: tuple[Judge, Fit] | None) -> Outcome:
+    def _concluded(self, out: Outcome, named: tuple[LeastSquaresProblem, Fit] | None) -> Outcome:
         if not out.tried:
             out.verdict = "named" if self.d.effects else "unknown"
             out.why = (
@@ -199,11 +199,11 @@ class Learner(CurveProblem):
             out.verdict = "learned"
         return out
 
-    def _as_tried(self, candidate: Candidate, judge: Judge, fit: Fit) -> Tried:
+    def _as_tried(self, candidate: Candidate, judge: LeastSquaresProblem, fit: Fit) -> FittedCandidate:
         """The laws of the library, to hold a candidate against them."""
-        return Tried(candidate, 0.0, judge, fit, (), errors=self.ground.errors((), fit.theta, fit.effects))
+        return FittedCandidate(candidate, 0.0, judge, fit, (), errors=self.ground.errors((), fit.theta, fit.effects))
 
-    def _earns(self, before: Tried, tried: Tried) -> bool:
+    def _earns(self, before: FittedCandidate, tried: FittedCandidate) -> bool:
         c = tried.candidate
         if c.quantity.stops:
             table, amplitudes = tried.table()
@@ -211,7 +211,7 @@ class Learner(CurveProblem):
                 return False
         return self.worth(before, tried)
 
-    def _with_formulas(self, before: Tried, good: Sequence[Tried], left: dict[str, float]) -> None:
+    def _with_formulas(self, before: FittedCandidate, good: Sequence[FittedCandidate], left: dict[str, float]) -> None:
         """Where the best curve still fails, or harms a test log, what each may leave with a formula in its place, else
         those of a plainer quantity: a corner or a jump is none for splines, and beyond what other blocks tell them they
         go astray. Where one of those is then before the best, all have theirs. Every formula counts as many numbers as
@@ -235,7 +235,7 @@ class Learner(CurveProblem):
             if min((left[t.candidate.name] for t in first), default=least) >= least:
                 break
 
-    def _tell_apart(self, good: Sequence[Tried], left: dict[str, float]) -> None:
+    def _tell_apart(self, good: Sequence[FittedCandidate], left: dict[str, float]) -> None:
         """Put those behind that are surely worse, block by block, than the best of what neither remembers nor drifts,
         where that leaves nothing but noise: at the noise a wrong channel that goes together with the right one leaves
         little more.
@@ -255,13 +255,15 @@ class Learner(CurveProblem):
         """
         return channel_of(candidate) in self.ground.measured and strange(candidate) > 0
 
-    def _preferred(self, tried: Tried, left: float) -> tuple[float, ...]:
+    def _preferred(self, tried: FittedCandidate, left: float) -> tuple[float, ...]:
         """What orders candidates that do as well: the plainer first; of equally plain ones that which leaves less, and
         where the held-out error is noise, less in all.
         """
         return *plain(tried.candidate), round(left, 2), rms_of(tried.judge, tried.fit)
 
-    def _near(self, before: Tried, good: list[Tried], left: Mapping[str, float]) -> list[Tried]:
+    def _near(
+        self, before: FittedCandidate, good: list[FittedCandidate], left: Mapping[str, float]
+    ) -> list[FittedCandidate]:
         """The candidates that do as well as the best, plainest first; ``good`` is put in order."""
         good.sort(key=lambda t: left[t.candidate.name])
         near = [t for t in good if left[t.candidate.name] < left[good[0].candidate.name] + RIVAL]
@@ -271,7 +273,7 @@ class Learner(CurveProblem):
         near += [t for t in alike if t in plainer or left[t.candidate.name] < limit]
         return sorted(near, key=lambda t: self._preferred(t, left[t.candidate.name]))
 
-    def _plainer(self, before: Tried, tried: Tried, best: Tried) -> bool:
+    def _plainer(self, before: FittedCandidate, tried: FittedCandidate, best: FittedCandidate) -> bool:
         """Whether a curve adds what the best one makes of a parameter, of the same quantity, and that does not earn its
         place before it: a damping times a function of the speed is a force that is one of the speed.
         """
@@ -282,7 +284,7 @@ class Learner(CurveProblem):
         mine, its = (self.tested(before, t, [tried, best]) for t in (tried, best))
         return mine < its + HARM
 
-    def _with_its_lag(self, current: Tried, best: Tried, steps: Sequence[float]) -> Tried:
+    def _with_its_lag(self, current: FittedCandidate, best: FittedCandidate, steps: Sequence[float]) -> FittedCandidate:
         """The curve with the lag that suits it best, by such ``steps`` up and down; or with the period."""
         q = best.candidate.quantity
         if q.period:  # by so many turns over the whole way
@@ -293,7 +295,7 @@ class Learner(CurveProblem):
                     best = more
         return best
 
-    def _slower(self, current: Tried, best: Tried, times: float) -> Tried | None:
+    def _slower(self, current: FittedCandidate, best: FittedCandidate, times: float) -> FittedCandidate | None:
         """The curve with a lag so many times as long; None where that is no better."""
         if (slower := best.candidate.slower(times)) is None or stands(current, slower):
             return None
@@ -304,7 +306,7 @@ class Learner(CurveProblem):
         falls = 0.5 * float(np.log(was.held_out.sum() / now.held_out.sum()))
         return more if worse < -STEP or (worse < STEP and falls > STEP) else None
 
-    def _begun(self, tried: Tried, candidate: Candidate) -> Array:
+    def _begun(self, tried: FittedCandidate, candidate: Candidate) -> Array:
         """Parameters from which a candidate begins that is nearly what has been fitted."""
         c, theta = tried.candidate, tried.fit.theta
         if candidate.splines == c.splines and candidate.parts == c.parts:
@@ -312,7 +314,7 @@ class Learner(CurveProblem):
         own = tried.judge.stage.index()[c.name]
         return np.concatenate([theta[: own.start], candidate.as_of(c, theta[own])])
 
-    def _settled(self, current: Tried, best: Tried) -> Tried:
+    def _settled(self, current: FittedCandidate, best: FittedCandidate) -> FittedCandidate:
         """The curve without mean, without slope, or without both, where the logs do not tell them from the model's own
         parameters.
 
@@ -337,10 +339,10 @@ class Learner(CurveProblem):
 
     # ---- candidates --------------------------------------------------------------------------------------------------
 
-    def _finalists(self, current: Tried) -> list[Tried]:
+    def _finalists(self, current: FittedCandidate) -> list[FittedCandidate]:
         """The candidates that promise most, fitted; best first."""
         near, (bare, promising) = current.slopes(beside=False), screened(self, current, QUICK, TIMES[0])
-        quick: list[Tried] = []
+        quick: list[FittedCandidate] = []
         if self.faint and not (promising and promises(bare, promising[0][0])):
             return []
         steps = MANY_STEPS if not self.ground.noise_known and bare > FAR_OFF**2 * self.judge.n else FEW_STEPS
@@ -395,7 +397,7 @@ class Learner(CurveProblem):
             done = [t for t in done if first_of[t.candidate.name] is t]
         return done
 
-    def _finished(self, current: Tried, quick: Tried) -> Tried:
+    def _finished(self, current: FittedCandidate, quick: FittedCandidate) -> FittedCandidate:
         """A candidate fitted to the end, as smooth and with the lag that suits it best."""
         begin = quick.fit if len(quick.judge.stage.t) == len(self.judge.stage.t) else quick.fit.theta
         done = smoothed(self, current, quick.candidate, begin, WIGGLES)
@@ -404,13 +406,13 @@ class Learner(CurveProblem):
             done = smoothed(self, current, replace(done.candidate, settled=settled), done.fit, WIGGLES, done.wiggle)
         return self._with_its_lag(current, done, TIMES[:1])
 
-    def _finer(self, current: Tried, coarse: Tried) -> Tried | None:
+    def _finer(self, current: FittedCandidate, coarse: FittedCandidate) -> FittedCandidate | None:
         """The same curve with `SPLINES` splines."""
         if (fine := coarse.candidate.finer(SPLINES)) is None:
             return None
         return self.fitted(current, fine, WIGGLES[-1], self._begun(coarse, fine), 12, slopes=coarse.slopes())
 
-    def _jumping(self, current: Tried, smooth: Tried) -> Tried | None:
+    def _jumping(self, current: FittedCandidate, smooth: FittedCandidate) -> FittedCandidate | None:
         """The same curve with a jump where its quantity is 0."""
         c = smooth.candidate.jumping() if self.ground.jumps else None
         if c is None:

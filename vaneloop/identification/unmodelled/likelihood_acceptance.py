@@ -14,38 +14,38 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.selection.likelihood_acceptance import (
     LEAST_SHARE,
     NATS,
     SPREADS,
-    NoiseFloor,
+    LikelihoodAcceptance,
     correlation_of,
     gain,
     rival_nats,
 )
 from vaneloop.identification.selection.relative_error_acceptance import RIVAL
 from vaneloop.identification.subsystem import Array
-from vaneloop.identification.unmodelled.fitted_candidate import Ground
+from vaneloop.identification.unmodelled.fitted_candidate import CandidateSource
 
 __all__ = ["above_the_noise", "earns", "grain_of", "in_grains", "promises", "unconfirmed"]
 
 
-def above_the_noise(judge: Judge, fit: Fit) -> bool:
+def above_the_noise(judge: LeastSquaresProblem, fit: Fit) -> bool:
     """Whether a fit's error is more than its noise, as well as that is known."""
-    criterion = NoiseFloor(judge)
+    criterion = LikelihoodAcceptance(judge)
     criterion.learn(fit)
     return criterion.fails(fit)
 
 
-def grain_of(judge: Judge, fit: Fit) -> float:
+def grain_of(judge: LeastSquaresProblem, fit: Fit) -> float:
     """Log error that counts as much as 1 does far from the noise, where the best model is ``fit`` of ``judge``."""
     correlation = correlation_of(judge, fit)
     nats = rival_nats(judge, float(fit.held_out.sum()), correlation)
     return min(1.0, nats * correlation / max(judge.n, 1) / RIVAL)
 
 
-def in_grains(ground: Ground, grain: float, judges: Iterable[Judge]) -> None:
+def in_grains(ground: CandidateSource, grain: float, judges: Iterable[LeastSquaresProblem]) -> None:
     """Compare the errors of a ground's stages, and those of these judges, in ``grain`` from now on."""
     ground.in_grains(grain)
     for judge in judges:
@@ -59,7 +59,7 @@ def promises(bare: float, best: float) -> bool:
     return bare - best > 2.0 * NATS
 
 
-def earns(judge: Judge, before: Fit, after: Fit, correlation: float) -> bool:
+def earns(judge: LeastSquaresProblem, before: Fit, after: Fit, correlation: float) -> bool:
     """Whether a curve gains enough nats on held-out blocks; ``correlation`` of the errors that it leaves."""
     fall, excess = before.held_out.sum() - after.held_out.sum(), before.held_out.sum() - judge.n
     extra = max(len(after.free) - len(before.free), 1)

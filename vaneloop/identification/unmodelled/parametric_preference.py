@@ -14,7 +14,7 @@ from vaneloop.identification.results import rms_of
 from vaneloop.identification.selection.likelihood_acceptance import correlation_of, rival_nats
 from vaneloop.identification.selection.relative_error_acceptance import MOST_LEFT
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
-from vaneloop.identification.unmodelled.fitted_candidate import MEASURED, Ground, Tried, strange
+from vaneloop.identification.unmodelled.fitted_candidate import MEASURED, CandidateSource, FittedCandidate, strange
 from vaneloop.identification.unmodelled.problem import CurveProblem
 
 __all__ = [
@@ -32,7 +32,7 @@ NEAR = 0.25  # log error within which a curve that does not earn its place may d
 FAR = 0.5  # log error from which what harms no test log is not taken instead of what does
 
 
-def in_its_place(ground: Ground, tried: Tried) -> list[Tried]:
+def in_its_place(ground: CandidateSource, tried: FittedCandidate) -> list[FittedCandidate]:
     """The model with each formula in a curve's place; mean and slope may be what parameters of the model could have,
     unless the curve is nothing else.
     """
@@ -42,12 +42,12 @@ def in_its_place(ground: Ground, tried: Tried) -> list[Tried]:
     return tried.loose
 
 
-def all_in_their_place(ground: Ground, tried: Sequence[Tried]) -> list[list[Tried]]:
+def all_in_their_place(ground: CandidateSource, tried: Sequence[FittedCandidate]) -> list[list[FittedCandidate]]:
     """`in_its_place` of several curves, side by side."""
     return list(side_by_side(lambda t: in_its_place(ground, t), tried, ground.shares))
 
 
-def at_its_place(before: Tried, good: Sequence[Tried]) -> list[Tried]:
+def at_its_place(before: FittedCandidate, good: Sequence[FittedCandidate]) -> list[FittedCandidate]:
     """Those of what is at their place itself that explain most of the error: where one is a corner, splines leave a
     tenth of it, and what follows them elsewhere leaves less.
     """
@@ -56,8 +56,8 @@ def at_its_place(before: Tried, good: Sequence[Tried]) -> list[Tried]:
 
 
 def earning_by_formula(
-    learner: CurveProblem, before: Tried, poor: Sequence[Tried], among: Sequence[Tried]
-) -> list[Tried]:
+    learner: CurveProblem, before: FittedCandidate, poor: Sequence[FittedCandidate], among: Sequence[FittedCandidate]
+) -> list[FittedCandidate]:
     """Of curves that do not earn their place, but are near the best of ``among`` or explain most of the error at their
     place itself, those of which a formula does; none of what remembers. A block that alone has been somewhere says
     nothing of splines there, and much of a formula.
@@ -69,7 +69,9 @@ def earning_by_formula(
     return [t for t, formulas in zip(near, said, strict=True) if any(learner.worth(before, f) for f in formulas)]
 
 
-def harmless(learner: CurveProblem, before: Tried, good: list[Tried], left: Mapping[str, float]) -> list[Tried]:
+def harmless(
+    learner: CurveProblem, before: FittedCandidate, good: list[FittedCandidate], left: Mapping[str, float]
+) -> list[FittedCandidate]:
     """Of curves those that harm no test log, or of which a formula does not, if one is near the best; else all.
 
     left  what orders them, by name
@@ -79,7 +81,9 @@ def harmless(learner: CurveProblem, before: Tried, good: list[Tried], left: Mapp
     return fine if any(left[t.candidate.name] < reach for t in fine) else good
 
 
-def without_memory(learner: CurveProblem, before: Tried, good: list[Tried]) -> list[Tried]:
+def without_memory(
+    learner: CurveProblem, before: FittedCandidate, good: list[FittedCandidate]
+) -> list[FittedCandidate]:
     """Without what remembers, where a memoryless curve leaves nothing but noise, and harms no test log: memory imitates
     much.
     """
@@ -88,7 +92,7 @@ def without_memory(learner: CurveProblem, before: Tried, good: list[Tried]) -> l
     return plain if enough else good
 
 
-def with_and_without_mean(ground: Ground, tried: Tried) -> list[Tried]:
+def with_and_without_mean(ground: CandidateSource, tried: FittedCandidate) -> list[FittedCandidate]:
     """The model with each formula in a curve's place, those that have the curve's mean and slope, and those of which
     parameters of the model may have them.
     """
@@ -98,7 +102,7 @@ def with_and_without_mean(ground: Ground, tried: Tried) -> list[Tried]:
     return [*strict, *(f for f in tried.loose if f not in strict)]
 
 
-def said_first(learner: CurveProblem, near: list[Tried], left: Mapping[str, float]) -> list[Tried]:
+def said_first(learner: CurveProblem, near: list[FittedCandidate], left: Mapping[str, float]) -> list[FittedCandidate]:
     """Those that do as well, plainest first, but before all others the plainest that a formula says, where the best of
     measured channels leaves nothing but a noise that is known. A channel that follows the right one has a curve that
     does as well, and seldom a formula.
@@ -122,11 +126,11 @@ def said_first(learner: CurveProblem, near: list[Tried], left: Mapping[str, floa
     return [first, *(t for t in near if t is not first)]
 
 
-def leaves(tried: Tried) -> float:
+def leaves(tried: FittedCandidate) -> float:
     """Held-out error, in noise floors, of a curve or of the best formula in its place."""
     return min(rms_of(t.judge, t.fit) for t in (tried, *(f for _, f in tried.formulas or ())))
 
 
-def better_than(learner: CurveProblem, before: Tried, tried: Tried) -> bool:
+def better_than(learner: CurveProblem, before: FittedCandidate, tried: FittedCandidate) -> bool:
     """Whether a curve, or a formula in its place, earns its place before something else."""
     return any(learner.worth(before, t) for t in (tried, *(f for _, f in tried.formulas or ())))

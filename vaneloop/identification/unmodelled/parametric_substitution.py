@@ -16,13 +16,13 @@ import numpy as np
 
 from vaneloop.base.forms import FORMS
 from vaneloop.identification.candidates.closed_forms import Formula, text_of
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.selection.relative_error_acceptance import HARM, PER_PARAMETER, RIVAL
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import effect_of, fitted_formulas, goes_on
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
-from vaneloop.identification.unmodelled.fitted_candidate import Ground, Tried, with_held_out
+from vaneloop.identification.unmodelled.fitted_candidate import CandidateSource, FittedCandidate, with_held_out
 from vaneloop.identification.unmodelled.learned_law import LearnedLaw
 from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.user_models.terms import runs
@@ -33,8 +33,8 @@ LEAST = 0.1  # share of a parameter that may be left when a formula takes its me
 
 
 def spoken(
-    learner: CurveProblem, curves: Sequence[Tried], laws: Sequence[LearnedLaw]
-) -> tuple[Tried, list[LearnedLaw]]:
+    learner: CurveProblem, curves: Sequence[FittedCandidate], laws: Sequence[LearnedLaw]
+) -> tuple[FittedCandidate, list[LearnedLaw]]:
     """The model with a formula in place of each curve that one does as well as, fitted together; and the laws with
     these formulas.
 
@@ -77,7 +77,7 @@ def spoken(
     return now, out
 
 
-def tell_each_by_its_formula(learner: CurveProblem, first: Tried, second: Tried) -> None:
+def tell_each_by_its_formula(learner: CurveProblem, first: FittedCandidate, second: FittedCandidate) -> None:
     """Formulas of two curves that stand beside each other: alone, what the second one says is in the first one's error,
     and leads its formulas astray. Where a formula of the first leaves less than both curves do, the second one has its
     formulas beside that.
@@ -91,16 +91,18 @@ def tell_each_by_its_formula(learner: CurveProblem, first: Tried, second: Tried)
         second.formulas = _formulas_beside(learner, second, best)
 
 
-def _formulas_beside(learner: CurveProblem, tried: Tried, pair: Tried) -> list[tuple[Formula, Tried]]:
+def _formulas_beside(
+    learner: CurveProblem, tried: FittedCandidate, pair: FittedCandidate
+) -> list[tuple[Formula, FittedCandidate]]:
     """Formulas of a curve as it is in a model with another one."""
     name = tried.candidate.name
     curves = (*(c for c in pair.curves if c[1].name != name), *(c for c in pair.curves if c[1].name == name))
-    judge = Judge(learner.ground.stage((), curves), learner.ground.floor, pair.settled)
+    judge = LeastSquaresProblem(learner.ground.stage((), curves), learner.ground.floor, pair.settled)
     fit = with_held_out(judge, judge.fit(tuple(e.name for _, e in curves), _as_in(pair, judge), 1))
     return fitted_formulas(learner.ground, tried.refitted(judge, fit, curves))
 
 
-def _as_in(tried: Tried, judge: Judge, but: str = "") -> Array:
+def _as_in(tried: FittedCandidate, judge: LeastSquaresProblem, but: str = "") -> Array:
     """Parameters of ``judge``'s model, with what a fit gave to those of the same name; ``but``: a curve that is not."""
     theta, index, own = judge.stage.neutral(), judge.stage.index(), len(judge.stage.parameters)
     theta[:own] = tried.fit.theta[:own]
@@ -110,7 +112,9 @@ def _as_in(tried: Tried, judge: Judge, but: str = "") -> Array:
     return theta
 
 
-def more_left(learner: CurveProblem, before: Tried, tried: Tried, among: Sequence[Tried]) -> tuple[float, list[float]]:
+def more_left(
+    learner: CurveProblem, before: FittedCandidate, tried: FittedCandidate, among: Sequence[FittedCandidate]
+) -> tuple[float, list[float]]:
     """Log of what a formula leaves over what stood there before it: held out where all of ``among`` know something,
     whatever numbers it has; and of each test log, over all its samples.
     """
@@ -133,8 +137,8 @@ def takes_mean_back(level: float, numbers: Array, own: Array, place: int) -> boo
 
 
 def _in_place(
-    ground: Ground, now: Tried, k: int, c: Candidate, formula: Formula, alone: Tried
-) -> tuple[Tried, Formula] | None:
+    ground: CandidateSource, now: FittedCandidate, k: int, c: Candidate, formula: Formula, alone: FittedCandidate
+) -> tuple[FittedCandidate, Formula] | None:
     """The model with a formula in place of its ``k``-th curve, fitted, and the formula as it then is; None where it is
     none.
 
@@ -150,7 +154,7 @@ def _in_place(
     table, jump = runs(form, *reach, ground.points)
     curves = list(now.curves)
     curves[k] = (c.placed_as(table, len(numbers), reach, jump), effect)
-    judge = Judge(ground.stage((), tuple(curves)), ground.floor, now.settled)
+    judge = LeastSquaresProblem(ground.stage((), tuple(curves)), ground.floor, now.settled)
     theta, index = _as_in(now, judge, c.name), judge.stage.index()
     theta[: len(own)] = own
     theta[index[c.name]] = numbers

@@ -9,16 +9,22 @@ import numpy as np
 
 from vaneloop.base.side_by_side import Answer, Item, side_by_side
 from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known
-from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import StageDiagnosis
 from vaneloop.identification.selection.likelihood_acceptance import correlation_of
-from vaneloop.identification.selection.relative_error_acceptance import HARM, LEAST_USE, ErrorShare, score, worth
+from vaneloop.identification.selection.relative_error_acceptance import (
+    HARM,
+    LEAST_USE,
+    RelativeErrorAcceptance,
+    score,
+    worth,
+)
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
 from vaneloop.identification.unmodelled.fitted_candidate import (
-    Ground,
+    CandidateSource,
+    FittedCandidate,
     Placings,
-    Tried,
     at_samples,
     told_by_others,
     with_held_out,
@@ -40,15 +46,15 @@ class CurveProblem:
     """
 
     def __init__(
-        self, ground: Ground, d: StageDiagnosis, progress: Callable[[float], None] | None = None,
+        self, ground: CandidateSource, d: StageDiagnosis, progress: Callable[[float], None] | None = None,
         shape: Sequence[str] = (), speaks: bool = True,
     ):  # fmt: skip
         self.ground, self.d, self.progress, self.shape = ground, d, progress or (lambda _: None), tuple(shape)
         self.speaks = speaks
-        self.ranked: list[list[Tried]] = []  # of each search for a curve, what was fitted, best first
+        self.ranked: list[list[FittedCandidate]] = []  # of each search for a curve, what was fitted, best first
         self.judge = self.judge_of((), ())
         self.base = self.judge.fit((), d.base.theta[: len(self.judge.stage.parameters)], 4)
-        self.form = ErrorShare(self.judge)
+        self.form = RelativeErrorAcceptance(self.judge)
         self.form.begin(self.base)
         self.faint = ground.noise_known and not self.form.fails(self.base)
         if self.faint:
@@ -57,19 +63,19 @@ class CurveProblem:
 
     def judge_of(
         self, laws: Sequence[str], curves: Placings, quick: bool = False, keep: Array | None = None
-    ) -> Judge:  # fmt: skip
-        return Judge(self.ground.stage(laws, curves, quick), self.ground.floor, keep)
+    ) -> LeastSquaresProblem:  # fmt: skip
+        return LeastSquaresProblem(self.ground.stage(laws, curves, quick), self.ground.floor, keep)
 
-    def fails(self, tried: Tried) -> bool:
+    def fails(self, tried: FittedCandidate) -> bool:
         """Whether there is any error beyond noise where it is judged."""
-        return ErrorShare(tried.judge).fails(tried.fit)
+        return RelativeErrorAcceptance(tried.judge).fails(tried.fit)
 
     def each(self, f: Callable[[Item], Answer], items: Iterable[Item]) -> Iterator[Answer]:
         """`side_by_side` where the ground's models allow it."""
         return side_by_side(f, items, self.ground.shares)
 
     @contextmanager
-    def told_in_nats(self, tried: Tried) -> Iterator[None]:
+    def told_in_nats(self, tried: FittedCandidate) -> Iterator[None]:
         """Compare errors in nats meanwhile, if a curve leaves nothing but a noise that is known: 1 % of the error there
         can be a hundred nats.
         """
@@ -81,7 +87,7 @@ class CurveProblem:
         finally:
             in_grains(self.ground, grain, [self.judge])
 
-    def _known(self, among: Sequence[Tried]) -> Array:
+    def _known(self, among: Sequence[FittedCandidate]) -> Array:
         """Samples where all these curves are told by more than one block."""
         start, n = self.judge.block_start, len(self.judge.stage.t)
         known = np.ones(n, dtype=bool)
@@ -92,19 +98,19 @@ class CurveProblem:
             known &= True if settled is None else settled
         return known if known.any() else ~known
 
-    def judged(self, tried: Tried, among: Sequence[Tried]) -> tuple[Judge, Fit]:
+    def judged(self, tried: FittedCandidate, among: Sequence[FittedCandidate]) -> tuple[LeastSquaresProblem, Fit]:
         """A fit with its held-out errors, where all curves of ``among`` know something."""
         known = self._known(among)
         if known.all():
             return self.judge, tried.fit
-        judge = Judge(self.judge.stage, self.ground.floor, keep=known)
+        judge = LeastSquaresProblem(self.judge.stage, self.ground.floor, keep=known)
         return judge, with_held_out(tried.judge, tried.fit, tried.counted(known))
 
-    def score(self, tried: Tried, among: Sequence[Tried] = ()) -> float:
+    def score(self, tried: FittedCandidate, among: Sequence[FittedCandidate] = ()) -> float:
         """What orders curves: `score`, where all of ``among`` (default: itself) know something."""
         return score(*self.judged(tried, among or [tried]))
 
-    def worth(self, before: Tried, tried: Tried) -> bool:
+    def worth(self, before: FittedCandidate, tried: FittedCandidate) -> bool:
         """Whether a curve earns its place, where it knows something and what it is held against does."""
         among = [tried, before] if before.curves else [tried]
         (judge, was), (_, now) = (self.judged(t, among) for t in (before, tried))
@@ -112,11 +118,11 @@ class CurveProblem:
             return earns(judge, was, now, correlation_of(tried.judge, tried.fit))
         return worth(judge, was, now, self.form.form).good
 
-    def left(self, before: Tried, tried: Tried, among: Sequence[Tried]) -> float:
+    def left(self, before: FittedCandidate, tried: FittedCandidate, among: Sequence[FittedCandidate]) -> float:
         """What orders candidates ``among`` which one is chosen: the score and what each makes of the test logs."""
         return self.score(tried, among) + self.tested(before, tried, among)
 
-    def tested(self, before: Tried, tried: Tried, among: Sequence[Tried]) -> float:
+    def tested(self, before: FittedCandidate, tried: FittedCandidate, among: Sequence[FittedCandidate]) -> float:
         """Log of what a curve makes of the test logs' error, where all of ``among`` know something."""
         inside = [self.ground.within(t.candidate) for t in among]
         part = {log: np.logical_and.reduce([i[log] for i in inside if log in i]) for i in inside for log in i}
@@ -124,14 +130,14 @@ class CurveProblem:
         tests = [c for log, c in change.items() if log in self.ground.tests]
         return float(np.mean(tests)) if tests else 0.0
 
-    def ordered(self, tried: Sequence[Tried]) -> list[Tried]:
+    def ordered(self, tried: Sequence[FittedCandidate]) -> list[FittedCandidate]:
         """The best first."""
         return sorted(tried, key=lambda t: self.score(t, tried))
 
     def fitted(
-        self, current: Tried, candidate: Candidate, wiggle: float, begin: Array | Fit, iterations: int,
+        self, current: FittedCandidate, candidate: Candidate, wiggle: float, begin: Array | Fit, iterations: int,
         quick: bool = False, slopes: Known = NOT_KNOWN,
-    ) -> Tried:  # fmt: skip
+    ) -> FittedCandidate:  # fmt: skip
         """A candidate fitted beside the model and its curves; ``begin``: parameters, or its fit as smooth as another
         ``wiggle`` makes it, on the same samples; ``slopes`` near there, as far as they are known.
         """
@@ -141,9 +147,9 @@ class CurveProblem:
         judge.sparing = True
         names = tuple(e.name for _, e in curves)
         fit = with_held_out(judge, judge.fit(names, begin, iterations, slopes=slopes))
-        return Tried(candidate, wiggle, judge, fit, curves)
+        return FittedCandidate(candidate, wiggle, judge, fit, curves)
 
-    def harmful(self, before: Tried, tried: Tried) -> str:
+    def harmful(self, before: FittedCandidate, tried: FittedCandidate) -> str:
         """Why the logs speak against a curve; "": they do not."""
         change = self.change(before, tried)
         if self.faint and (why := unconfirmed(before.errors or {}, tried.errors or {}, self.ground.tests)):
@@ -155,12 +161,14 @@ class CurveProblem:
             return f"no log is better by {LEAST_USE:.0%} for it"
         return ""
 
-    def change(self, before: Tried, tried: Tried, part: Mapping[str, Array] | None = None) -> dict[str, float]:
+    def change(
+        self, before: FittedCandidate, tried: FittedCandidate, part: Mapping[str, Array] | None = None
+    ) -> dict[str, float]:
         """Log of the error with a curve over that without, log by log; ``part``: of these logs, of these samples."""
         was, now = self._levels(before, part or {}), self._levels(tried, part or {})
         return {log: now[log] - was[log] for log in was if log in now}
 
-    def _levels(self, of: Tried, part: Mapping[str, Array]) -> dict[str, float]:
+    def _levels(self, of: FittedCandidate, part: Mapping[str, Array]) -> dict[str, float]:
         if of.errors is None:
             of.errors = self.ground.errors(of.curves, of.fit.theta)
         out = {}

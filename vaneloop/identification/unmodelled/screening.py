@@ -10,11 +10,11 @@ import numpy as np
 
 from vaneloop.base.durations import within_no_period
 from vaneloop.identification.least_squares.broyden import bounded_step
-from vaneloop.identification.least_squares.problem import Fit, Judge
-from vaneloop.identification.selection.screening import Slopes
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
+from vaneloop.identification.selection.screening import Linearisation
 from vaneloop.identification.subsystem import Array, Effect
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
-from vaneloop.identification.unmodelled.fitted_candidate import Placings, Tried, channel_of, stands, strange
+from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate, Placings, channel_of, stands, strange
 from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.unmodelled.spectral_lines import Course, Lines, periods_along
 from vaneloop.identification.user_models.exogenous_regressors import TIME
@@ -30,10 +30,10 @@ PROBE, SMALL = "probe", 1e-2  # a constant by which a place is moved to see what
 KEPT = 0.5  # of what slopes promise that a step must bring; else a place is too crooked to be ranked by it
 CROOKED = 24  # of such candidates, those that are promised most are fitted for `FEW` steps
 Promise = tuple[float, Candidate, Array]  # what a candidate would leave, and parameters to begin from
-Starts = Sequence[tuple[Array, Slopes]]
+Starts = Sequence[tuple[Array, Linearisation]]
 
 
-def screened(learner: CurveProblem, current: Tried, many: int, apart: float) -> tuple[float, list[Promise]]:
+def screened(learner: CurveProblem, current: FittedCandidate, many: int, apart: float) -> tuple[float, list[Promise]]:
     """What a step of the model's own parameters leaves; and the ``many`` best candidates, and the best at each other
     place, best first.
 
@@ -71,7 +71,7 @@ def _one_lag(promises: Iterable[Promise]) -> list[Promise]:
 
 
 def _straightened(
-    learner: CurveProblem, current: Tried, bare: float, steps: Sequence[tuple[Promise, float]], many: int
+    learner: CurveProblem, current: FittedCandidate, bare: float, steps: Sequence[tuple[Promise, float]], many: int
 ) -> list[Promise]:
     """All candidates, best first; those fitted for some steps that one step does no justice. A tank's level goes with
     one over its outflow: where that is off by half, no step by slopes brings what its gain can.
@@ -90,7 +90,7 @@ def _straightened(
     return sorted([*learner.each(fitted, chosen), *(p for p in out if id(p) not in gone)], key=lambda o: o[0])
 
 
-def _its_lag(learner: CurveProblem, current: Tried, one: Promise, starts: Starts, apart: float) -> Promise:
+def _its_lag(learner: CurveProblem, current: FittedCandidate, one: Promise, starts: Starts, apart: float) -> Promise:
     """A candidate with the lag that promises most."""
     for factor in (apart, 1.0 / apart) if one[1].quantity.remembers else ():
         while (c := one[1].slower(factor)) is not None and not stands(current, c):
@@ -101,7 +101,7 @@ def _its_lag(learner: CurveProblem, current: Tried, one: Promise, starts: Starts
     return one
 
 
-def _periodic(learner: CurveProblem, current: Tried) -> list[Candidate]:
+def _periodic(learner: CurveProblem, current: FittedCandidate) -> list[Candidate]:
     """Every curve that may repeat itself, over time or along another channel, with the periods of the error; none where
     a shape is known.
     """
@@ -134,7 +134,7 @@ def _along(learner: CurveProblem, courses: Sequence[Course]) -> list[Candidate]:
 
 
 def _in_time(
-    learner: CurveProblem, current: Tried, over_time: Sequence[Candidate], courses: Sequence[Course]
+    learner: CurveProblem, current: FittedCandidate, over_time: Sequence[Candidate], courses: Sequence[Course]
 ) -> list[Candidate]:  # fmt: skip
     fit, ground = current.fit, learner.ground
     lines = Lines(courses)
@@ -154,7 +154,9 @@ def _in_time(
     return out
 
 
-def _promise(learner: CurveProblem, current: Tried, candidate: Candidate, starts: Starts) -> tuple[Promise, float]:
+def _promise(
+    learner: CurveProblem, current: FittedCandidate, candidate: Candidate, starts: Starts
+) -> tuple[Promise, float]:
     """What a candidate leaves, in the simulation, after one step by the slopes, as damped as suits it best, from where
     that leaves least; and what the slopes there say that it leaves.
 
@@ -190,7 +192,7 @@ class Step(NamedTuple):
     promised: float
 
 
-def starts_of(judge: Judge, fit: Fit) -> list[tuple[Array, Slopes]]:
+def starts_of(judge: LeastSquaresProblem, fit: Fit) -> list[tuple[Array, Linearisation]]:
     """Parameters from which a candidate's step is taken, with their slopes: those of the fit; and where what is missing
     has pulled one of the model's own to a bound, those that are nominal, too.
 
@@ -204,10 +206,12 @@ def starts_of(judge: Judge, fit: Fit) -> list[tuple[Array, Slopes]]:
     room = [np.abs(b - fit.theta)[free] for b in judge.bounds()]
     if np.any(np.minimum(*room) <= 1e-6 * judge.scale[free]):
         starts.append(nominal)
-    return [(theta, Slopes(judge, theta, fit.free, fit.prior)) for theta in starts]
+    return [(theta, Linearisation(judge, theta, fit.free, fit.prior)) for theta in starts]
 
 
-def best_step(fit: Fit, effect: Effect, judge: Judge, begin: Array, slopes: Slopes, cut_off: bool = False) -> Step:
+def best_step(
+    fit: Fit, effect: Effect, judge: LeastSquaresProblem, begin: Array, slopes: Linearisation, cut_off: bool = False
+) -> Step:
     """The best step from ``begin`` with ``effect``, the last of the judge's stage.
 
     cut_off  a step beyond bounds ends there; else what a bound stops, others take over
@@ -245,9 +249,9 @@ SCREENED = 1.0  # of the standard deviations of a first bend that are tried, the
 
 
 def smoothed(
-    learner: CurveProblem, current: Tried, candidate: Candidate, begin: Array | Fit, wiggles: Sequence[float],
+    learner: CurveProblem, current: FittedCandidate, candidate: Candidate, begin: Array | Fit, wiggles: Sequence[float],
     first: float = SCREENED,
-) -> Tried:  # fmt: skip
+) -> FittedCandidate:  # fmt: skip
     """A candidate fitted to the end, as smooth as suits it best: from the ``first`` of ``wiggles`` smoother, else less
     so, while that helps, each from where the last one ended.
     """

@@ -16,7 +16,7 @@ from vaneloop.base.curve import FINE_SIDE as FINE
 from vaneloop.base.curve import POINTS
 from vaneloop.base.forms import FORMS, Form, product
 from vaneloop.identification.candidates.closed_forms import Formula, begin, text_of
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.selection.relative_error_acceptance import FORM, RIVAL, score
 from vaneloop.identification.subsystem import Array
@@ -31,7 +31,7 @@ from vaneloop.identification.unmodelled.closed_form_fits import (
     effect_of,
     goes_on,
 )  # fmt: skip
-from vaneloop.identification.unmodelled.fitted_candidate import Ground, Tried, with_held_out
+from vaneloop.identification.unmodelled.fitted_candidate import CandidateSource, FittedCandidate, with_held_out
 from vaneloop.identification.unmodelled.parametric_substitution import more_left, takes_mean_back
 from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.unmodelled.surface_candidates import SurfaceCandidate
@@ -58,7 +58,7 @@ class Product(Formula):
         return one, other
 
 
-def fitted_products(ground: Ground, tried: Tried) -> list[tuple[Formula, Tried]]:
+def fitted_products(ground: CandidateSource, tried: FittedCandidate) -> list[tuple[Formula, FittedCandidate]]:
     """The products that come nearest to a surface, each fitted in the simulation in its place; best first."""
     c = tried.candidate
     assert isinstance(c, SurfaceCandidate)
@@ -72,7 +72,7 @@ def fitted_products(ground: Ground, tried: Tried) -> list[tuple[Formula, Tried]]
     return sorted(fitted, key=lambda f: np.log(f[0].error) + PER_NUMBER * len(f[0].numbers))
 
 
-def likely_products(tried: Tried, before: float) -> list[Formula]:
+def likely_products(tried: FittedCandidate, before: float) -> list[Formula]:
     """Of the products that were fitted those that do as well as the best, simplest first.
 
     before  held-out error without the surface, in noise floors: no law's form is known better than `FORM` of it
@@ -125,7 +125,7 @@ class _Factor:
 
 
 def _factors(
-    tried: Tried, c: SurfaceCandidate, samples: tuple[Array, Array], lent: bool
+    tried: FittedCandidate, c: SurfaceCandidate, samples: tuple[Array, Array], lent: bool
 ) -> tuple[_Factor, _Factor] | None:
     """The curves whose product comes nearest to a surface; None where none is near.
 
@@ -162,8 +162,8 @@ def _factors(
 
 
 def _in_simulation(
-    ground: Ground, tried: Tried, c: SurfaceCandidate, first: Begun, second: Begun
-) -> tuple[Formula, Tried] | None:
+    ground: CandidateSource, tried: FittedCandidate, c: SurfaceCandidate, first: Begun, second: Begun
+) -> tuple[Formula, FittedCandidate] | None:
     """A product in the surface's place, fitted with the model's own parameters."""
     (one, a), (other, b) = first, second
     own = tried.fit.theta[: tried.judge.stage.index()[c.name].start]
@@ -172,8 +172,8 @@ def _in_simulation(
 
 
 def _fitted(
-    ground: Ground, tried: Tried, one: Form, other: Form, theta: Array, ends: Ends, lent: bool
-) -> tuple[Formula, Tried] | None:
+    ground: CandidateSource, tried: FittedCandidate, one: Form, other: Form, theta: Array, ends: Ends, lent: bool
+) -> tuple[Formula, FittedCandidate] | None:
     """A product of two formulas in the surface's place, over these ranges of its quantities, and on test logs as far as
     it goes on; None where it is none.
 
@@ -198,7 +198,7 @@ def _fitted(
         return c.placed_as(lambda n: product(one, other, own, its, n) - mean(n), count, ends[0], across=ends[1])
 
     curves = (*tried.curves[:-1], (placed(ends), effect))
-    judge = Judge(ground.stage((), curves), ground.floor)
+    judge = LeastSquaresProblem(ground.stage((), curves), ground.floor)
     judge.sparing = True
     if not np.all(np.isfinite(judge.stage.run(theta[None]))):
         return None
@@ -220,7 +220,7 @@ def _fitted(
     return formula, tried.refitted(judge, fit, further)
 
 
-def reach_of(ground: Ground, tried: Tried, formula: Product) -> Ends:
+def reach_of(ground: CandidateSource, tried: FittedCandidate, formula: Product) -> Ends:
     """From where to where a product goes on, of each quantity: as far as its formula of that one does."""
     c, numbers = tried.candidate, list(formula.numbers.values())
     assert isinstance(c, SurfaceCandidate)
@@ -230,7 +230,9 @@ def reach_of(ground: Ground, tried: Tried, formula: Product) -> Ends:
     return own, its
 
 
-def as_the_law(learner: CurveProblem, tried: Tried, formulas: Sequence[Formula]) -> tuple[Tried, Product] | None:
+def as_the_law(
+    learner: CurveProblem, tried: FittedCandidate, formulas: Sequence[Formula]
+) -> tuple[FittedCandidate, Product] | None:
     """The simplest product that does as well as its surface, held out and on every test log, in its place as far as it
     goes on; None where there is none.
     """

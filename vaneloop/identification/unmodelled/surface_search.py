@@ -14,7 +14,7 @@ import numpy as np
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.selection.relative_error_acceptance import RIVAL, UNKNOWN, score
 from vaneloop.identification.subsystem import Array
-from vaneloop.identification.unmodelled.fitted_candidate import Outcome, Tried, plain, strange
+from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate, Outcome, plain, strange
 from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.unmodelled.screening import SCREENED, smoothed
 from vaneloop.identification.unmodelled.surface_candidates import SPLINES, SurfaceCandidate, may_be_of, surface_of
@@ -39,7 +39,7 @@ def put_surface(learner: CurveProblem, out: Outcome) -> None:
         return
     if last and any(not learner.fails(f) for _, f in last.formulas or ()):
         return
-    nothing = Tried(learner.candidates[0], 0.0, learner.judge, learner.base, ())
+    nothing = FittedCandidate(learner.candidates[0], 0.0, learner.judge, learner.base, ())
     done = _finished(learner, nothing)
     sums = list(learner.each(lambda t: _sum(learner, nothing, t), done))
     others = [nothing, *([last] if last else []), *sums]
@@ -61,7 +61,9 @@ def put_surface(learner: CurveProblem, out: Outcome) -> None:
     out.tried = [replace(best, rivals=[t.candidate.name for t in near if t is not best])]
 
 
-def _does_as_well(learner: CurveProblem, before: Tried, surface: Tried, formula: Tried) -> bool:
+def _does_as_well(
+    learner: CurveProblem, before: FittedCandidate, surface: FittedCandidate, formula: FittedCandidate
+) -> bool:
     """Whether a formula does as well as its surface where that has been learned, and harms no log that goes further."""
     near = learner.score(formula, [formula, surface]) < learner.score(surface, [formula, surface]) + RIVAL
     return near and not learner.harmful(before, formula)
@@ -85,7 +87,7 @@ def _candidates(learner: CurveProblem) -> list[SurfaceCandidate]:
     return [s for _, one, two in both[:TRIED] if (s := surface_of(one, two)) is not None]
 
 
-def _finished(learner: CurveProblem, nothing: Tried) -> list[Tried]:
+def _finished(learner: CurveProblem, nothing: FittedCandidate) -> list[FittedCandidate]:
     """The surfaces that promise most, fitted to the end in place of all curves; best first."""
     one_step = lambda c: learner.fitted(nothing, c, SCREENED, _begin(learner, nothing, c), 1, True)  # noqa: E731
     begun = list(learner.each(one_step, _candidates(learner)))
@@ -104,7 +106,7 @@ def _finished(learner: CurveProblem, nothing: Tried) -> list[Tried]:
     return [t for t in done if first_of[t.candidate.name] is t]
 
 
-def _begin(learner: CurveProblem, nothing: Tried, c: SurfaceCandidate) -> Array:
+def _begin(learner: CurveProblem, nothing: FittedCandidate, c: SurfaceCandidate) -> Array:
     """Parameters to begin from: the best curve of either quantity at the same place, where one was fitted alone. A step
     from no law at all goes astray where a state that runs away is one of the quantities.
     """
@@ -126,7 +128,7 @@ def _begin(learner: CurveProblem, nothing: Tried, c: SurfaceCandidate) -> Array:
     return out
 
 
-def _finer(learner: CurveProblem, nothing: Tried, coarse: Tried) -> Tried | None:
+def _finer(learner: CurveProblem, nothing: FittedCandidate, coarse: FittedCandidate) -> FittedCandidate | None:
     """The same surface with `FINE` splines of each quantity."""
     c = coarse.candidate
     assert isinstance(c, SurfaceCandidate)
@@ -140,7 +142,7 @@ def _finer(learner: CurveProblem, nothing: Tried, coarse: Tried) -> Tried | None
     return smoothed(learner, nothing, fine, theta, WIGGLES, coarse.wiggle)
 
 
-def _sum(learner: CurveProblem, nothing: Tried, whole: Tried) -> Tried:
+def _sum(learner: CurveProblem, nothing: FittedCandidate, whole: FittedCandidate) -> FittedCandidate:
     """The sum of a curve of each of a surface's quantities, at its place."""
     c = whole.candidate
     assert isinstance(c, SurfaceCandidate)

@@ -17,16 +17,16 @@ from plant import Model
 from vaneloop.base.tables import read
 from vaneloop.identification.candidates import laws
 from vaneloop.identification.candidates.laws import HYSTERETIC
-from vaneloop.identification.least_squares.problem import Fit, Judge
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import StageDiagnosis, answer_of, at_bound, rms_of
 from vaneloop.identification.selection.diagnosis import Judged
-from vaneloop.identification.selection.relative_error_acceptance import ErrorShare
+from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance
 from vaneloop.identification.subsystem import Array, StageError
 from vaneloop.identification.user_models.bound_system import BoundSystem, rms_of_rows
 from vaneloop.identification.user_models.simulation import STARTS_LOADED
 from vaneloop.identification.user_models.system import Record, System
 
-__all__ = ["NO_HELP", "ByLog", "Logs", "as_given", "bind", "doubts", "load_model_of"]
+__all__ = ["NO_HELP", "ByLog", "Logs", "as_given", "bind", "load_model_of", "parameter_warnings"]
 
 NO_HELP = 0.85  # error with a law over error without it, from which it hardly helps
 
@@ -57,7 +57,7 @@ class Logs:
             by = {log: v for log, v in self.figures(theta).items() if np.isfinite(v).all()}
             return {log: float(np.log(np.maximum(v / floor, 1.0)).mean()) for log, v in by.items()}
 
-        return partial(ErrorShare, figures=levels, tests=frozenset(self.test.logs if self.test else ()))
+        return partial(RelativeErrorAcceptance, figures=levels, tests=frozenset(self.test.logs if self.test else ()))
 
 
 def bind(system: System, logs: Sequence[Record], test: Sequence[Record] = (), model: Model | None = None) -> Logs:
@@ -69,7 +69,7 @@ def bind(system: System, logs: Sequence[Record], test: Sequence[Record] = (), mo
 
 def as_given(logs: Logs, fit: Fit) -> StageDiagnosis:
     """The model with nothing added, as it was fitted to say where it fails."""
-    judge = Judge(logs.fitted.thinned, logs.fitted.floor)
+    judge = LeastSquaresProblem(logs.fitted.thinned, logs.fitted.floor)
     return answer_of(judge, "none", fit, fit, [], [("model", rms_of(judge, fit))])
 
 
@@ -94,7 +94,7 @@ class ByLog:
     def of(cls, logs: Logs, d: StageDiagnosis, before: Model | None = None) -> ByLog:
         """Work it out; ``before``: the model that the answer started from."""
         bound, final = logs.fitted, d.final
-        judge = Judge(bound.thinned, d.floor)
+        judge = LeastSquaresProblem(bound.thinned, d.floor)
         named = {"model": d.base.theta}
         # the waterfall log by log: laws in the order in which they came in, each step fitted
         theta = d.base.theta
@@ -122,7 +122,7 @@ class ByLog:
             out.model.effects[f.effect] = {k: float(str(v["value"])) for k, v in f.parameters.items()}
         return out
 
-    def _ablate(self, judge: Judge) -> None:
+    def _ablate(self, judge: LeastSquaresProblem) -> None:
         bound, final = self.logs.fitted, self.d.final
         last = list(self.steps.values())[-1]
         for name in final.effects:
@@ -133,7 +133,7 @@ class ByLog:
                 by = self.logs.figures(without.theta)
             self.ablation[name] = {log: float(np.exp(np.nanmean(np.log(last[log] / by[log])))) for log in by}
 
-    def _remark(self, judge: Judge) -> None:
+    def _remark(self, judge: LeastSquaresProblem) -> None:
         bound, d = self.logs.fitted, self.d
         for name, ratios in self.ablation.items():
             for log, r in ratios.items():
@@ -147,7 +147,7 @@ class ByLog:
                 was = f"it was {v0:.4g} {p.unit} while {laws} was missing"
                 self.notes.append(f"{p.name}: not needed any more, set to 0 ({was})")
         self.notes += [*_loaded(bound, judge, d), *d.notes]
-        self.notes += [n for n in doubts(bound, judge, d) if n not in self.notes]
+        self.notes += [n for n in parameter_warnings(bound, judge, d) if n not in self.notes]
 
     def together(self) -> dict[str, dict[str, Array]]:
         """RMS error of each output over all samples of the fitted logs, and of the test logs: step -> "fitted" | "test"
@@ -241,7 +241,7 @@ def _size(y: Array) -> float:
     return float(np.sqrt(np.nanmean(y**2))) if np.isfinite(y).any() and np.nanmax(np.abs(y)) > 0.0 else 1.0
 
 
-def _loaded(bound: BoundSystem, judge: Judge, d: StageDiagnosis) -> list[str]:
+def _loaded(bound: BoundSystem, judge: LeastSquaresProblem, d: StageDiagnosis) -> list[str]:
     """What it would change to start springs with the force that was measured at the start."""
     codes = {q.effect: q.law.code for q in bound.placed}
     springs = [e for e in (*d.final.effects, *bound.present) if codes[e] in HYSTERETIC]
@@ -307,7 +307,7 @@ BACKWARDS = {
 ROUND = "is a sign the other way round?"
 
 
-def doubts(bound: BoundSystem, judge: Judge, d: StageDiagnosis) -> list[str]:
+def parameter_warnings(bound: BoundSystem, judge: LeastSquaresProblem, d: StageDiagnosis) -> list[str]:
     """Parameters and laws at their bounds, and signs that physics or convention speak against, a line each."""
     out = []
     fit = d.final
@@ -338,7 +338,7 @@ def doubts(bound: BoundSystem, judge: Judge, d: StageDiagnosis) -> list[str]:
     return out + _against(bound)
 
 
-def _pulled(fit: Fit, judge: Judge, column: int, side: float) -> bool:
+def _pulled(fit: Fit, judge: LeastSquaresProblem, column: int, side: float) -> bool:
     """Whether the logs would have a parameter go on beyond the bound at which it stands."""
     where = np.flatnonzero(fit.free == column)
     if not len(where):

@@ -16,7 +16,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.hysteresis import STOPS, stops_of
 from vaneloop.base.vanes import VANES
 from vaneloop.identification.candidates.spline_basis import COUNT, basis_of
-from vaneloop.identification.least_squares.problem import Judge
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.selection.subsampled_search import excerpt_of
 from vaneloop.identification.subsystem import Array, Effect, Parameter, Stage
@@ -34,7 +34,7 @@ from vaneloop.identification.vane_chain.subsystem_data import Driven, Made
 __all__ = [
     "OF_STROKE",
     "SCALE",
-    "VaneGround",
+    "VaneChainCandidates",
     "curve_effect",
     "remade",
     "reversals",
@@ -148,8 +148,8 @@ def without_laws(stages: Sequence[Stage], laws: Sequence[str]) -> list[Stage]:
     return out
 
 
-class VaneGround:
-    """A stage of the vane chain on its log (`identification.unmodelled.learning.Ground`).
+class VaneChainCandidates:
+    """A stage of the vane chain on its log (`identification.unmodelled.learning.CandidateSource`).
 
     stage  with all laws that it can have
     floor  noise of its outputs; None: its own
@@ -168,7 +168,7 @@ class VaneGround:
         self.tests: frozenset[str] = frozenset()
         self.measured = frozenset(stage.outputs) & frozenset(VANES)
         self.whole = stage
-        judge = Judge(stage, stage.floor)
+        judge = LeastSquaresProblem(stage, stage.floor)
         fit = judge.fit((), stage.neutral(), 1)
         piece = PIECE if stage.window else FREE_PIECE
         if stage.excerpt is not None and len(stage.t) > WHOLE:
@@ -202,7 +202,7 @@ class VaneGround:
         for name, stage, part in asked:
             if stage is None or (name == REST and REST not in self.tests):
                 continue
-            judge = Judge(remade(stage, laws, curves), self.floor, part)
+            judge = LeastSquaresProblem(remade(stage, laws, curves), self.floor, part)
             out[name] = np.where(judge.valid, judge.errors(theta[None])[0], np.nan)
         return out
 
@@ -243,7 +243,7 @@ class VaneGround:
         stage = self.stage((), ())
         assert isinstance(stage.made, Made)
         driven = stage.made.driven
-        judge = Judge(stage, self.floor)
+        judge = LeastSquaresProblem(stage, self.floor)
         fit = judge.fit((), theta, 1)
         error = float(np.max(np.sqrt(np.sum((judge.errors(fit.theta[None])[0] * judge.floor[:, None]) ** 2, axis=1)
                                      / np.maximum(judge.valid.sum(axis=1), 1))))  # fmt: skip
@@ -284,7 +284,7 @@ class VaneGround:
         for c in candidates:
             if c.place in usual or c.quantity.stops:
                 continue
-            judge = Judge(self.stage((), ((c.placed(), c.effect(1.0)),)), self.floor)
+            judge = LeastSquaresProblem(self.stage((), ((c.placed(), c.effect(1.0)),)), self.floor)
             moved = np.repeat(np.concatenate([theta, np.zeros(len(c.kept))])[None], 2, axis=0)
             moved[1, len(theta)] = PROBED * c.size  # a constant at that place
             still, by = judge.errors(moved)

@@ -84,9 +84,9 @@ def divergence(
     from hil.logs import Channel, Log
     from hil.loop.lockstep import Stimulus, lockstep
     from plant import Model, build_plant
-    from vaneloop.identification.least_squares.problem import Judge
+    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
     from vaneloop.identification.selection.diagnosis import floor_of
-    from vaneloop.identification.selection.likelihood_acceptance import NoiseFloor, correlation_of, gain
+    from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, correlation_of, gain
     from vaneloop.identification.selection.search import Search
     from vaneloop.identification.vane_chain.chain import build_chain
 
@@ -118,8 +118,8 @@ def divergence(
         return full(wide)
 
     s.run = reduced
-    judge = Judge(s, floor_of(s))
-    search = Search(NoiseFloor(judge))
+    judge = LeastSquaresProblem(s, floor_of(s))
+    search = Search(LikelihoodAcceptance(judge))
     best, other = (search.joined((*beside, name)) for name in (named, rival))
     return gain(judge, other, best, correlation_of(judge, best))
 
