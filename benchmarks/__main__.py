@@ -5,12 +5,9 @@ benchmarks/results/latest.json. Never fails for a slow figure.
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from dataclasses import asdict
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the `vaneloop` command does, before numpy is imported
 
 from rich import box
 from rich.console import Console

@@ -2,7 +2,7 @@
 
 python -m benchmarks fleet                          # the folder of 100,000 logs, and the workers; free cores
 python -m benchmarks.fleet kills [SEED]             # fifty kills at moments drawn by chance; two minutes
-python -m benchmarks.fleet judge RUN TRUTH.json     # a run over the logs of `vaneloop fleet demo`
+python -m benchmarks.fleet judge RUN TRUTH.json     # a run over the logs of benchmarks.fleet_demo
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from benchmarks.fleet_demo import YEAR, YEARS, make
 from benchmarks.measure import ROOT, Row
 
 __all__ = ["MEASUREMENTS", "judged"]
@@ -105,7 +106,7 @@ def workers() -> Iterator[Row]:
     """
     with tempfile.TemporaryDirectory() as place:
         logs = f"{place}/logs"
-        _measured("fleet", "demo", "--engines", "12", "--logs", "360", "--out", logs)
+        make(Path(logs), engines=12, logs=360, duration=60.0, seed=1, workers=2, progress=lambda fraction: None)
         seconds = []
         for n in (1, 1, 2):  # the first run compiles
             few = logs if seconds else f"{logs}/engine_000"
@@ -203,14 +204,13 @@ def killed(place: Path, kills: int, logs: int, seed: int) -> dict[str, Any]:
 
 
 def judged(run: str, truth_file: str) -> dict[str, Any]:
-    """Hold the report of a run against ``truth.json`` of `vaneloop fleet demo`.
+    """Hold the report of a run against ``truth.json`` of `benchmarks.fleet_demo`.
 
     A growth is found where the engine's own quantity is said to change: the effect's parameter, or the nominal one that
     it moves. Its onset is right within a tenth of the time axis.
     """
     from plant.effects import EFFECTS
     from vaneloop.base.vanes import VANES
-    from vaneloop.cli.fleet_demo import YEAR, YEARS
     from vaneloop.fleet.folder import Folder
     from vaneloop.fleet.report import view_of
     from vaneloop.fleet.sources import moment

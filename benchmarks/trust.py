@@ -3,7 +3,7 @@
     python -m benchmarks.trust fit effects.parquet laws.parquet        # coefficients for selection/calibration.py
     python -m benchmarks.trust judge effects2.parquet laws2.parquet    # reliability, Brier score, 90 % set of names
 
-The files are results of `vaneloop hidden-effect` and `vaneloop hidden-law`. Fit and judgement must not see the same
+The files are results of `benchmarks.hidden_effect` and `benchmarks.hidden_law`. Fit and judgement must not see the same
 seeds.
 """
 
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from vaneloop.cli.blind import share
+from benchmarks.blind import share
 from vaneloop.identification.selection.calibration import COEFFICIENTS, terms, trust
 
 RIDGE = 1.0  # observations that a coefficient of 0 is worth: few answers must not make a name certain
@@ -38,7 +38,7 @@ def names_of(rows: list[Row]) -> list[Name]:
     """Every name of every answer of a blind benchmark."""
     out = []
     for r in rows:
-        law = "amounts" in r  # a row of hidden-law
+        law = "amounts" in r  # a row of hidden_law
         for e in json.loads(r["answer"]).get("effects", []):
             if law:
                 right = {n for n in e["probabilities"] if any(n in json.loads(r["same"])[t] for t in r["truth"])}

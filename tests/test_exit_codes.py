@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-import importlib
+import importlib.util
 import os
 import subprocess
 import sys
@@ -12,11 +12,12 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import start
 from tests.conftest import ROOT
 from tests.test_structure import PACKAGES
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
-from vaneloop.cli.main import COMMANDS, main
+from vaneloop.cli.main import COMMANDS, IN_CHECKOUT, main
 
 LOG = str(ROOT / "examples" / "hidden_effect.parquet")
 
@@ -118,7 +119,7 @@ MODULES = {
 
 def test_what_a_number_must_be_is_said_with_the_number() -> None:
     without = []
-    for file in (ROOT / "vaneloop" / "cli").glob("*.py"):
+    for file in (*(ROOT / "vaneloop" / "cli").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "InputError" and node.args:
                 said = node.args[0]
@@ -130,21 +131,31 @@ def test_what_a_number_must_be_is_said_with_the_number() -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["fleet", "demo", "--out", "x", "--logs", "3"], "--logs (=3) must be in [4, 100000]"),
+        (["fleet_demo", "--out", "x", "--logs", "3"], "--logs (=3) must be in [4, 100000]"),
         (
-            ["fleet", "demo", "--out", "x", "--engines", "9", "--logs", "8"],
+            ["fleet_demo", "--out", "x", "--engines", "9", "--logs", "8"],
             "--engines (=9) must be in [4, 8], no more than --logs",
         ),
-        (["fleet", "demo", "--out", "x", "--workers", "0"], "--workers (=0) must be in [1, 64]"),
-        (["hidden-effect", "--logs", "0"], "--logs (=0) must be in [1, 100000]"),
-        (["hidden-effect", "--workers", "65"], "--workers (=65) must be in [1, 64]"),
-        (["hidden-effect", "--duration", "5"], "--duration (=5 s) must be in [30, 1e5]"),
-        (["hidden-effect", "--seed", "-1"], "--seed (=-1) must be in [0, 2^63)"),
+        (["fleet_demo", "--out", "x", "--workers", "0"], "--workers (=0) must be in [1, 64]"),
+        (["hidden_effect", "--logs", "0"], "--logs (=0) must be in [1, 100000]"),
+        (["hidden_effect", "--workers", "65"], "--workers (=65) must be in [1, 64]"),
+        (["hidden_effect", "--duration", "5"], "--duration (=5 s) must be in [30, 1e5]"),
+        (["hidden_effect", "--seed", "-1"], "--seed (=-1) must be in [0, 2^63)"),
     ],
 )
 def test_a_number_out_of_range_is_named(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(words) == 2
+    assert start.main(f"benchmarks.{words[0]}", words[1:]) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("words", "module"), IN_CHECKOUT.items())
+def test_what_is_no_command_any_more_says_where_it_is(
+    words: str, module: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*words.split(), "--workers", "1"]) == 2
+    line = complaint(capsys.readouterr().err)
+    assert line == f"vaneloop: '{words}' is not a command; in a checkout: python -m {module}"
+    assert importlib.util.find_spec(module) is not None and words.split()[-1] not in COMMANDS
 
 
 def test_every_module_that_can_be_run_is_in_the_list() -> None:

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ from tests.browser import open_to_all
 pytest.importorskip("psutil", reason="the extra `fleet` is not installed")
 pytest.importorskip("duckdb", reason="the extra `fleet` is not installed")
 
+from benchmarks import start
+from benchmarks.fleet_demo import YEARS, fate, size_at
 from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
 from vaneloop.cli.main import main
@@ -493,10 +496,6 @@ def test_a_folder_of_a_hundred_thousand_logs(tmp_path: Path) -> None:
 
 
 def test_the_fates_of_a_simulated_fleet_are_known() -> None:
-    from collections import Counter
-
-    from vaneloop.cli.fleet_demo import YEARS, fate, size_at
-
     fates = [fate(1, e, 40) for e in range(40)]
     count = Counter(f["fate"] for f in fates)
     assert count["badly rigged"] == count["sensor exchanged"] == 1
@@ -513,8 +512,8 @@ def test_the_fates_of_a_simulated_fleet_are_known() -> None:
 def test_a_small_simulated_fleet_runs_from_logs_to_page(tmp_path: Path) -> None:
     """Eight real logs: simulated, diagnosed by two workers, reported; the badly rigged engine lacks something."""
     logs, run = str(tmp_path / "logs"), str(tmp_path / "run")
-    done = command("demo", "--engines", "4", "--logs", "8", "--duration", "60", "--out", logs)
-    assert done.returncode == 0, done.stderr
+    words = ["--engines", "4", "--logs", "8", "--duration", "60", "--out", logs]
+    assert start.main("benchmarks.fleet_demo", words) == 0
     done = command("run", logs, "--out", run)
     assert done.returncode == 0 and "8 of 8" in done.stdout, done.stderr
     done = command("report", run, "--report", str(tmp_path / "fleet.html"))

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from benchmarks import blind
 from hil.calibrate import elements, prepare
 from hil.logs import Channel, LogError, log, read_log, write_log
 from hil.logs.recorder import SUFFIXES, Recorder, read_record
@@ -38,7 +39,6 @@ from tests.test_record import some_frames
 from tests.test_xcp_spec import shipped
 from vaneloop.base import files
 from vaneloop.base.errors import InputError
-from vaneloop.cli import blind
 from vaneloop.cli.attended import _Keeper
 from vaneloop.cli.main import COMMANDS, main
 from vaneloop.design.schedule_files import write_tables
@@ -164,10 +164,9 @@ RECORDED = "test_a_recording_on_a_full_disk_is_whole"
 JSON = "as of every other command"
 # options that the cases leave out: where what they write is tried
 ELSEWHERE = {
-    **{(name, "json"): JSON for name in ("run", "ecu", "record", "new-controller", "hidden-effect", "hidden-law")},
-    **{(f"fleet {name}", "json"): JSON for name in ("run", "work", "demo")},
-    **{(name, "out"): RUN_FOLDER for name in ("campaign", "fleet run", "fleet demo")},
-    **{(name, "out"): "test_rows_of_a_blind_benchmark" for name in ("hidden-effect", "hidden-law")},
+    **{(name, "json"): JSON for name in ("run", "ecu", "record", "new-controller")},
+    **{(f"fleet {name}", "json"): JSON for name in ("run", "work")},
+    **{(name, "out"): RUN_FOLDER for name in ("campaign", "fleet run")},
     **{("run", "record"): RECORDED, ("record", "out"): RECORDED},
     ("learn", "python"): "test_a_law_in_python",
     ("fleet report", "tables_out"): "DuckDB writes beside the target, tests/test_fleet_folder.py",
@@ -201,7 +200,7 @@ def test_every_option_that_writes_a_file_is_tried() -> None:
     found = {(name, option) for name, option in options_that_write() if option != "save_crash"}
     assert found == tried | ELSEWHERE.keys() and not tried & ELSEWHERE.keys()
     assert {name for name, _ in found} == {n for n in COMMANDS if n not in ("web", "completion", "fleet")} | {
-        f"fleet {n}" for n in ("run", "work", "status", "report", "demo")
+        f"fleet {n}" for n in ("run", "work", "status", "report")
     }
 
 

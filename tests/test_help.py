@@ -1,5 +1,5 @@
-"""What `vaneloop COMMAND --help` shows can be typed: options that exist, files that are there or are made by an example
-before.
+"""What `vaneloop COMMAND --help` shows can be typed, and what a benchmark's shows, too: options that exist, files that
+are there or are made by an example before.
 """
 
 from __future__ import annotations
@@ -13,40 +13,49 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import start
 from hil.logs import Channel, read_log, write_log
 from tests.conftest import ROOT
 from vaneloop.base import terminal
-from vaneloop.cli.main import COMMANDS, main
+from vaneloop.cli.main import COMMANDS, IN_CHECKOUT, main
 
 _FILE = re.compile(r"[\w./-]+\.(?:log|asc|blf|trc|mf4|csv|parquet|toml|dbc|html|py|json)|[\w./-]+/")
 _MAKES = {"--out", "--record", "--report", "--json"}
+# what follows `vaneloop` or `python -m` -> the module that takes the words after it
+MODULES = {name: module for name, (module, _) in COMMANDS.items()} | {module: module for module in IN_CHECKOUT.values()}
+
+
+def typed(words: list[str]) -> int:
+    """Run the words behind ``vaneloop`` or ``python -m``; return the exit code."""
+    return main(words) if words[0] in COMMANDS else start.main(words[0], words[1:])
 
 
 def parser_of(name: str) -> terminal.Parser:
-    module = importlib.import_module(COMMANDS[name][0])
+    module = importlib.import_module(MODULES[name])
     parser = terminal.Parser(prog=f"vaneloop {name}", description=module.DESCRIPTION)
     module.add_options(parser)
     return parser
 
 
 def examples(name: str) -> list[list[str]]:
-    """Words behind ``vaneloop`` of every example in the help of a command; what stands two blanks away is a remark."""
+    """Words behind ``vaneloop`` or ``python -m`` of every example in a help; what is two blanks away is a remark."""
     text = parser_of(name).format_help()
     lines = re.search(r"^examples:\n((?:  .*\n?)+)", text, re.M)
-    assert lines, f"vaneloop {name} --help shows no example"
+    assert lines, f"{name} --help shows no example"
     out = []
     for line in lines[1].splitlines():
         command = re.split(r"\S(?=\s{2,})", line.strip(), maxsplit=1)[0]
         whole = line.strip()[: len(command) + 1]
-        assert "vaneloop " in whole, line
-        out.append(shlex.split(whole[whole.index("vaneloop ") :])[1:])
+        program = re.search(r"\b(?:vaneloop|python -m) ", whole)
+        assert program, line
+        out.append(shlex.split(whole[program.end() :]))
     return out
 
 
 def made() -> set[str]:
     """Files and folders that the examples of all commands write."""
     out = set()
-    for name in COMMANDS:
+    for name in MODULES:
         for words in examples(name):
             out |= {b for a, b in zip(words, words[1:], strict=False) if a in _MAKES}
             if words[0] in ("record", "new-controller"):
@@ -54,13 +63,13 @@ def made() -> set[str]:
     return out
 
 
-@pytest.mark.parametrize("name", list(COMMANDS))
+@pytest.mark.parametrize("name", list(MODULES))
 def test_every_example_of_the_help_parses(name: str) -> None:
     for words in examples(name):
         parser_of(words[0]).parse_args(words[1:])  # exits with 2 where an option does not exist
 
 
-@pytest.mark.parametrize("name", list(COMMANDS))
+@pytest.mark.parametrize("name", list(MODULES))
 def test_every_file_that_the_help_names_is_there(name: str) -> None:
     """It is in the checkout, an example makes it, or it is in capitals: the reader's own."""
     there = made()
@@ -68,7 +77,7 @@ def test_every_file_that_the_help_names_is_there(name: str) -> None:
     for words in examples(name):
         for before, word in zip(words, words[1:], strict=False):
             if _FILE.fullmatch(word) and before not in _MAKES and word not in there and not word.startswith(folders):
-                assert (ROOT / word).exists() or Path(word).stem.isupper(), f"vaneloop {' '.join(words)}: {word}"
+                assert (ROOT / word).exists() or Path(word).stem.isupper(), f"{' '.join(words)}: {word}"
 
 
 def test_a_missing_file_and_a_wrong_option_in_an_example_would_be_seen() -> None:
@@ -94,12 +103,13 @@ NOT_RUN = {
     "replay YOURS.log": "a log and a DBC of the reader's own: tests/test_logs.py",
     "schedule --log LOOP.mf4": "another format of the loop that the example before it takes",
     "fuzz --replay": "needs a failure to repeat: tests/test_fuzz.py makes one",
-    "hidden-effect --logs 200": "the same as the example before it, on more logs",
-    "hidden-law --systems": "minutes a system: tests/test_hidden_law.py",
+    "benchmarks.hidden_effect --logs 200": "the same as the example before it, on more logs",
+    "benchmarks.hidden_law --systems": "minutes a system: tests/test_hidden_law.py",
     "learn LOG": "logs and a model of the reader's own: tests/test_learn.py",
     "extend NEW": "goes on from the example before it: tests/test_learn.py",
     "compare NEW": "goes on from the example before it: tests/test_learn.py",
     "fleet": "logs of many engines, workers of a cluster: tests/test_fleet_run.py",
+    "benchmarks.fleet_demo": "logs of some engines: tests/test_fleet_report.py makes them",
     "campaign": "a plan of the reader's own, workers of a cluster: tests/test_campaign.py",
     "a2l --out mine.a2l --controller": "a library of the reader's own: tests/test_xcp.py",
     "export-fmu --part plant --model M.toml": "a model of the reader's own: tests/test_fmu.py",
@@ -109,14 +119,15 @@ SMALLER = {"--frames 10000000": "--frames 20000", "--logs 40": "--logs 1 --durat
            "--logs 60": "--logs 1 --duration 60",
            "--out out/motor.parquet": "--out out/motor.parquet --logs 1 --duration 60"}  # fmt: skip
 # commands whose examples take long
-LONG = {"strategies", "design", "spatial", "clearance", "experiment", "diagnose", "hidden-effect", "engine-test"}
+LONG = {"strategies", "design", "spatial", "clearance", "experiment", "diagnose", "engine-test",
+        "benchmarks.hidden_effect"}  # fmt: skip
 LONG_EXAMPLES = {"inject --all", "schedule --geometry", "engine-test --tables"}
 
 
 def runs(long: bool) -> list[tuple[str, str]]:
     """Command and example, as it is run: the quick ones, or the long ones."""
     out = []
-    for name in COMMANDS:
+    for name in MODULES:
         for words in examples(name):
             line = shlex.join(words)
             if any(line == k or line.startswith(f"{k} ") for k in NOT_RUN) or "(" in line or "|" in words:
@@ -153,7 +164,7 @@ def run(line: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     for words, instead in SMALLER.items():
         line = line.replace(words, instead)
-    assert main(shlex.split(line)) in (0, 1), f"vaneloop {line}"
+    assert typed(shlex.split(line)) in (0, 1), line
 
 
 @pytest.mark.parametrize(("name", "line"), runs(long=False), ids=lambda x: x)
@@ -168,7 +179,7 @@ def test_a_long_example_of_the_help_runs(name: str, line: str, reader: Path, mon
 
 
 def test_every_exception_is_an_example_of_some_help() -> None:
-    lines = [shlex.join(words) for name in COMMANDS for words in examples(name)]
+    lines = [shlex.join(words) for name in MODULES for words in examples(name)]
     assert [k for k in [*NOT_RUN, *LONG, *LONG_EXAMPLES] if not any(x.startswith(k) for x in lines)] == []
     assert [k for k in SMALLER if not any(k in x for x in lines)] == []
 

@@ -11,6 +11,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks import start
+from benchmarks.hidden_effect import _named_where, _sizes, _too_easy, draw_case, judge_case, learned_right
+from benchmarks.same_curve import like_it, with_effect
 from hil.logs import Channel, Log
 from plant.curve import PLACES, QUANTITIES
 from plant.effects import EFFECTS
@@ -19,9 +22,7 @@ from tests.firmware_on_rig import firmware
 from tests.rig import CATALOGUE, WITH_MOTOR, Hidden, load_geometry
 from tests.rig.left_out import LEFT_OUT
 from vaneloop.base.tables import path
-from vaneloop.cli.hidden_effect import _named_where, _sizes, _too_easy, draw_case, judge_case, learned_right
 from vaneloop.cli.main import main
-from vaneloop.cli.same_curve import like_it, with_effect
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.vane_chain.chain import build_chain
 
@@ -71,7 +72,7 @@ def test_a_machine_that_the_rig_does_not_have_is_refused_in_one_line(tmp_path, c
     table = path("plant.toml").read_text()
     other = tmp_path / "other.toml"
     other.write_text(re.sub(r"(flow_gain = \{ value = )[0-9.]+", r"\g<1>5.5", table, count=1))
-    assert main(["hidden-effect", "--plant", str(other), "--out", str(tmp_path / "x.parquet")]) == 2
+    assert start.main("benchmarks.hidden_effect", ["--plant", str(other), "--out", str(tmp_path / "x.parquet")]) == 2
     said = capsys.readouterr().err
     assert str(other) in said and "the rig has the machines of plant.toml and" in said and "Traceback" not in said
 

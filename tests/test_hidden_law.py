@@ -15,6 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from benchmarks import hidden_law, start
+from benchmarks.blind import as_curve
 from tests.nominal_systems import NOMINAL, nominal
 from tests.rig_systems import FAMILIES, LEARNED, Case, Family, Hidden, draw_case, left_out, left_over
 from tests.rig_systems.cases import RATES, hide
@@ -22,9 +24,6 @@ from tests.rig_systems.laws import Size, draw_values, on_signal
 from tests.rig_systems.simulate import course, simulate
 from tests.system_variants import SCALES, rescaled, variants
 from vaneloop import Record, System
-from vaneloop.cli import hidden_law
-from vaneloop.cli.blind import as_curve
-from vaneloop.cli.main import main
 from vaneloop.identification import Parameter
 from vaneloop.identification.candidates import laws
 from vaneloop.identification.candidates.library import LAWS
@@ -33,6 +32,7 @@ from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.kernel import build_kernels
 from vaneloop.verbs import search
 
+MODULE = "benchmarks.hidden_law"
 # sensors whose law the product reads back, to where the state must have been
 READ_BACK = (".bias", ".gain", ".cubic", ".square_root", ".smooth_saturation", ".dead_zone")
 CLOSE = 0.25  # noise floors between the product with the true law and the truth
@@ -421,10 +421,10 @@ def test_a_diagnosis_that_raises_is_a_row_with_its_error(monkeypatch: pytest.Mon
 @pytest.mark.slow
 def test_a_run_goes_on_where_it_was_stopped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "r.parquet"
-    words = ["hidden-law", "--seed", "3", "--family", "valve_bench", "--workers", "1", "--out", str(out)]
-    assert main([*words, "--systems", "1", "--quiet"]) == 0
+    words = ["--seed", "3", "--family", "valve_bench", "--workers", "1", "--out", str(out)]
+    assert start.main(MODULE, [*words, "--systems", "1", "--quiet"]) == 0
     first = pq.read_table(out).to_pylist()
-    assert main([*words, "--systems", "2", "--json", str(tmp_path / "r.json")]) == 0
+    assert start.main(MODULE, [*words, "--systems", "2", "--json", str(tmp_path / "r.json")]) == 0
     both = pq.read_table(out).to_pylist()
     assert [r["index"] for r in both] == [0, 1] and both[0] == first[0]
     assert "1 systems done before" in capsys.readouterr().out
@@ -434,7 +434,7 @@ def test_a_run_goes_on_where_it_was_stopped(tmp_path: Path, capsys: pytest.Captu
         (["--seed", "3"], "drawn from families valve_bench; allowed: the same --family, or another --out"),
         (["--seed", "3", "--family", "valve_bench", "--variants"], "has rows without variants"),
     ):
-        assert main(["hidden-law", "--systems", "1", "--out", str(out), *more]) == 2
+        assert start.main(MODULE, ["--systems", "1", "--out", str(out), *more]) == 2
         err = capsys.readouterr().err
         assert said in err and len(err.strip().splitlines()) == 1
 
@@ -450,7 +450,7 @@ def test_a_run_goes_on_where_it_was_stopped(tmp_path: Path, capsys: pytest.Captu
     ],
 )
 def test_bad_options_are_told_in_one_line(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["hidden-law", *words]) == 2
+    assert start.main(MODULE, words) == 2
     err = capsys.readouterr().err
     assert said in err and len(err.strip().splitlines()) == 1
 
@@ -458,8 +458,8 @@ def test_bad_options_are_told_in_one_line(words: list[str], said: str, capsys: p
 def test_a_file_that_is_no_result_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bad = tmp_path / "bad.parquet"
     pq.write_table(pa.table({"a": [1]}), bad)
-    assert main(["hidden-law", "--out", str(bad)]) == 2
-    assert "not a result of hidden-law" in capsys.readouterr().err
+    assert start.main(MODULE, ["--out", str(bad)]) == 2
+    assert "not a result of hidden_law" in capsys.readouterr().err
 
 
 # ---- variants --------------------------------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from benchmarks.blind import as_curve
 from plant import Model, load_model, write_model
 from plant.model import Learned
 from tests.browser import open_to_all
@@ -27,7 +28,6 @@ from vaneloop import InputError, Record, System, unknown
 from vaneloop.base.curve import POINTS, on_table
 from vaneloop.base.forms import FORMS
 from vaneloop.base.tables import read
-from vaneloop.cli.blind import as_curve
 from vaneloop.identification import StageError
 from vaneloop.identification.candidates.closed_forms import begin, text_of
 from vaneloop.identification.candidates.spline_basis import basis_of

@@ -15,11 +15,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.same_law import same_by_equations
 from plant import write_model
 from plant.model import Learned, Model
 from vaneloop import Record, System, unknown
 from vaneloop.base.tables import read
-from vaneloop.cli.same_law import same_by_equations
 from vaneloop.identification import StageError
 from vaneloop.identification.candidates.closed_forms import Formula
 from vaneloop.identification.unmodelled.curve_candidates import UserModelCandidates, candidates, with_curves

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
+from benchmarks.hidden_law import surface_summary
 from plant import Model, load_model, write_model
 from plant.model import Learned, Second
 from tests.browser import open_to_all
@@ -28,7 +29,6 @@ from vaneloop import InputError, Record, System, compare, extend, unknown
 from vaneloop.base.curve import SIDE, on_grid
 from vaneloop.base.hull import hull_of, nearest_within, within
 from vaneloop.base.tables import read
-from vaneloop.cli.hidden_law import surface_summary
 from vaneloop.identification import StageError
 from vaneloop.identification.unmodelled.curve_candidates import with_curves
 from vaneloop.identification.user_models.bound_system import BoundSystem

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.same_law import same_by_equations
 from vaneloop import Record, System, unknown
-from vaneloop.cli.same_law import same_by_equations
 from vaneloop.identification.candidates.closed_forms import Formula
 from vaneloop.identification.user_models.bound_system import BoundSystem
 

@@ -17,6 +17,7 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.pythons import PYTHONS
+from vaneloop.cli.main import IN_CHECKOUT
 
 PACKAGES = ("controller", "plant", "hil", "vaneloop")
 OURS = {*PACKAGES, "tests", "benchmarks", "examples"}
@@ -51,8 +52,6 @@ DOORS: dict[str, tuple[str, ...]] = {
         "vaneloop.identification.user_models.load",
         "vaneloop.identification.user_models.system",
     ),
-    # the blind benchmarks hide effects and laws with simulators of the checkout, and say so where there is none
-    "vaneloop/cli/blind.py": ("tests",),
 }
 CLOCKS_AND_BUSES = {
     "asyncio",
@@ -304,6 +303,36 @@ def test_a_forbidden_import_is_caught(file: str, source: str, caught: str | None
         assert found == []
     else:
         assert any(c.endswith(f" imports {caught}") for c in found), found
+
+
+CHECKOUT = ("tests", "benchmarks")  # folders of Python that are not installed
+
+
+def names_of_the_checkout(source: str) -> list[str]:
+    """Modules of the checkout that ``source`` imports, or has as a text, which importlib may be given."""
+    texts = [n.value for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
+    spelled = [text for text in texts if re.fullmatch(r"\w+(\.\w+)+", text)]
+    imported = [name for _, name in imported_names(source, "x.py")]
+    return [name for name in (*imported, *spelled) if name.split(".")[0] in CHECKOUT]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_code_of_the_product_names_what_is_not_installed(package: str) -> None:
+    told = {"vaneloop/cli/main.py": set(IN_CHECKOUT.values())}  # what a user is told to type
+    found = {
+        (f.relative_to(ROOT).as_posix(), name)
+        for f in python_files(package)
+        for name in names_of_the_checkout(f.read_text(encoding="utf-8"))
+    }
+    assert found == {(file, name) for file, names in told.items() if file.startswith(package) for name in names}
+
+
+@pytest.mark.parametrize(
+    "source", ["from tests import rig", "def f():\n    import benchmarks.blind", "m = load(['tests.rig'])"]
+)
+def test_a_name_of_what_is_not_installed_is_caught(source: str) -> None:
+    assert names_of_the_checkout(source)
+    assert not names_of_the_checkout("'see tests/rig'; row = {'tests': 4}  # tests.rig")
 
 
 def packages_with_init() -> list[str]:

@@ -131,8 +131,7 @@ NEAREST = {
     ),
     "vaneloop.cli": (
         "help exit_codes completion verbs search_commands campaign fuzz inject record design fleet_report fmu "
-        "guess hidden_effect hidden_law schedule strategies spatial same_law never_worse native xcp uds "
-        "reading electromechanical"
+        "guess schedule strategies spatial never_worse native xcp uds reading electromechanical"
     ),
     "vaneloop.web": "web moments",
 }

@@ -27,7 +27,6 @@ on it at once. Needs the extra `fleet`: pip install 'vaneloop[fleet]'. See docs/
   work    join a run from this or another machine
   status  how far a run is
   report  tables and a page of what the logs say together
-  demo    logs of a simulated fleet whose truth is known (needs a checkout)
 
 examples:
   vaneloop fleet run examples/ --out out/fleet
@@ -37,7 +36,6 @@ examples:
   vaneloop fleet work out/fleet
   vaneloop fleet status out/fleet --json -
   vaneloop fleet report out/fleet --report fleet.html --tables-out TABLES
-  vaneloop fleet demo --engines 4 --logs 20 --duration 60 --out out/fleet_logs
 
 exit codes: 0 done (report: nothing found), 1 a part of the run is damaged (report: or an engine lacks something or is
 unlike its sisters), 2 bad input"""
@@ -66,13 +64,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     work = parts.add_parser("work", help="join a run from this or another machine")
     status = parts.add_parser("status", help="how far a run is")
     report = parts.add_parser("report", help="tables and a page of what the logs say together")
-    demo = parts.add_parser("demo", help="logs of a simulated fleet whose truth is known (needs a checkout)")
-    demo.add_argument("--out", required=True, metavar="DIR", help="folder of the logs; what is there stays")
-    demo.add_argument("--engines", type=int, default=40, metavar="N", help="number of engines (default 40)")
-    demo.add_argument("--logs", type=int, default=2000, metavar="N", help="logs of all together (default 2000)")
-    demo.add_argument("--duration", type=float, default=60.0, metavar="S", help="length of a log (default 60 s)")
-    demo.add_argument("--seed", type=int, default=1, metavar="S", help="seed of the draw (default 1)")
-    demo.add_argument("--workers", type=int, default=2, metavar="N", help="logs simulated side by side (default 2)")
     for part in (work, status, report):
         part.add_argument("run", metavar="RUN", help="folder of the run")
     _add_patience(work)
@@ -80,7 +71,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     report.add_argument("--limits", metavar="F.csv", help="columns quantity, limit: where an effect's parameter or a "
                         "nominal one ends its life; of a nominal one without, the end of its tolerance")  # fmt: skip
     report.add_argument("--tables-out", metavar="DIR", help="write every table as Parquet and CSV")
-    for part in (run, work, status, demo):
+    for part in (run, work, status):
         terminal.add_output_options(part)
     terminal.add_output_options(report, report=True)
 
@@ -93,7 +84,7 @@ def _add_patience(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     needs("vaneloop fleet", "psutil", "duckdb", "ruptures")
-    parts = {"run": _run, "work": _work, "status": _status, "report": _report, "demo": _demo}
+    parts = {"run": _run, "work": _work, "status": _status, "report": _report}
     with unusable():
         return parts[args.part](args)
 
@@ -233,25 +224,6 @@ def tell_damaged(args: argparse.Namespace, damaged: dict[str, str]) -> None:
     if damaged:
         rows = [[name, why] for name, why in damaged.items()]
         terminal.print_table(args, "damaged, and left out (the same fleet run does it anew)", ["part", "reason"], rows)
-
-
-def _demo(args: argparse.Namespace) -> int:
-    from vaneloop.cli.fleet_demo import make
-
-    if not 4 <= args.logs <= 100_000:
-        raise InputError(f"--logs (={args.logs}) must be in [4, 100000]")
-    if not 4 <= args.engines <= args.logs:
-        raise InputError(f"--engines (={args.engines}) must be in [4, {args.logs}], no more than --logs")
-    if not 1 <= args.workers <= 64:
-        raise InputError(f"--workers (={args.workers}) must be in [1, 64]")
-    if not 30.0 <= args.duration <= 1e5:
-        raise InputError(f"--duration (={args.duration:g} s) must be in [30, 1e5]")
-    with terminal.progress_bar(args, "simulating the fleet") as progress:
-        truth = make(Path(args.out), args.engines, args.logs, args.duration, args.seed, args.workers,
-                     progress or (lambda fraction: None))  # fmt: skip
-    terminal.say(args, f"truth: {truth}; next: vaneloop fleet run {args.out} --out RUN")
-    terminal.write_json(args, {"schema": 1, "truth": str(truth)})
-    return 0
 
 
 def _patience(args: argparse.Namespace) -> float:

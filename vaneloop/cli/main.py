@@ -9,7 +9,7 @@ import sys
 from vaneloop.base import terminal
 from vaneloop.base.errors import meant
 
-__all__ = ["COMMANDS", "main", "run"]
+__all__ = ["COMMANDS", "IN_CHECKOUT", "main", "run"]
 
 # command -> (module with add_options, command and DESCRIPTION; one line of help)
 COMMANDS = {
@@ -35,14 +35,6 @@ COMMANDS = {
     ),
     "extend": ("vaneloop.cli.extend", "add effects to the model, fitted to a log; writes a model file"),
     "experiment": ("vaneloop.cli.experiment", "the demand profile that best tells the remaining rivals apart"),
-    "hidden-effect": (
-        "vaneloop.cli.hidden_effect",
-        "blind benchmark of the diagnosis: effects hidden by an independent rig (needs a checkout)",
-    ),
-    "hidden-law": (
-        "vaneloop.cli.hidden_law",
-        "blind benchmark for users' own models: laws hidden in systems of many families (needs a checkout)",
-    ),
     "fleet": ("vaneloop.cli.fleet", "many engines, many logs: who lacks what, since when, how fast it grows"),
     "campaign": (
         "vaneloop.cli.campaign",
@@ -75,6 +67,12 @@ COMMANDS = {
     "completion": ("vaneloop.cli.completion", "completion of commands and options for bash, zsh and fish"),
     "web": ("vaneloop.web.command", "the workbench in the browser: missing physics, schedule, run"),
 }
+# what was a command once -> the module of a checkout that it is now
+IN_CHECKOUT = {
+    "hidden-effect": "benchmarks.hidden_effect",
+    "hidden-law": "benchmarks.hidden_law",
+    "fleet demo": "benchmarks.fleet_demo",
+}
 
 _HELP = f"""Real-time engine-controller firmware simulator: variable guide vanes, their controller, their bus.
 
@@ -106,6 +104,10 @@ def _main(argv: list[str]) -> int:
         print(f"vaneloop {version('vaneloop')}")
         return 0
     name = argv[0]
+    if (gone := next((w for w in (name, " ".join(argv[:2])) if w in IN_CHECKOUT), None)) is not None:
+        module = IN_CHECKOUT[gone]
+        print(f"vaneloop: {gone!r} is not a command; in a checkout: python -m {module}", file=sys.stderr)
+        return 2
     if name not in COMMANDS:
         near = meant(name, COMMANDS)
         print(f"vaneloop: {name!r} is not a command{near}; allowed: {', '.join(COMMANDS)}", file=sys.stderr)

@@ -1,7 +1,7 @@
 """How far a name can be trusted: the probability that the law which is missing is the one named or among its rivals.
 
 The search's own shares say which of the laws *that it tried* explains the log best. They cannot say how often none of
-them is it. That is learnt from blind answers (`vaneloop hidden-effect`, `vaneloop hidden-law`), by a logistic
+them is it. That is learnt from blind answers (`benchmarks/hidden_effect.py`, `hidden_law.py`), by a logistic
 regression (Platt 1999) on what an answer shows of itself:
 
 | term | a name is doubted |
@@ -24,7 +24,7 @@ __all__ = ["COEFFICIENTS", "Evidence", "terms", "trust"]
 Evidence = Mapping[str, float]  # left, fall, share: see `terms`
 
 # Constant, left, fall, share; by the criterion that named the law. Fitted to the names of development seeds: 37 of 60
-# logs of hidden-effect (seed 7), 73 of 117 diagnoses of hidden-law (seeds 1 and 2). With so few, the vane chain's names
+# logs of hidden_effect (seed 7), 73 of 117 diagnoses of hidden_law (seeds 1 and 2). With so few, the vane chain's names
 # differ by nothing yet: nine in ten are right.
 COEFFICIENTS: dict[str, tuple[float, float, float, float]] = {
     "noise_floor": (1.99, -0.01, 0.05, 0.0),

@@ -14,7 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from vaneloop.cli.blind import Row
+from benchmarks.blind import Row
+from vaneloop.identification.candidates.closed_forms import values_of
+from vaneloop.identification.unmodelled.regressors import quantities
+from vaneloop.identification.user_models.terms import INPUT, OUTPUT
+from vaneloop.identification.user_models.user_code import UserCode
 
 __all__ = ["same_by_equations"]
 
@@ -25,13 +29,11 @@ Array = np.ndarray
 
 def same_by_equations(law: Any, bound: Any, model: Any, at: str, of: str, value: Callable[[Array], Array]) -> Row:
     """Share of the drawn values at which a hidden law is within a learned one's band, and whether a formula that was
-    given is the hidden law; as of `vaneloop.cli.blind.as_curve`.
+    given is the hidden law; as of `benchmarks.blind.as_curve`.
 
     law    as learned, on the logs in ``bound``; ``model``: with the true parameters
     at, of, value   place, quantity ("": none) and curve of the hidden law
     """
-    from vaneloop.identification.candidates.closed_forms import values_of
-
     world = _World(bound, model)
     own = {
         **dict.fromkeys(world.inputs, "input adds"),
@@ -70,10 +72,6 @@ class _World:
     """A model with its true parameters at values of its states and inputs, drawn independently of each other."""
 
     def __init__(self, bound: Any, model: Any):
-        from vaneloop.identification.unmodelled.regressors import quantities
-        from vaneloop.identification.user_models.terms import INPUT, OUTPUT
-        from vaneloop.identification.user_models.user_code import UserCode
-
         rng = np.random.default_rng(0)
         self.model, self.code = model, UserCode(model, bound.data.in_names)
         self.inputs = list(model.commands) if model.kind == "closed_loop" else list(bound.data.in_names)

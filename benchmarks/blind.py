@@ -1,24 +1,24 @@
-"""What the two blind benchmarks share: modules of the checkout, a run that goes on where it was stopped, shares."""
+"""What the two blind benchmarks share: a run that goes on where it was stopped, what a learned curve is, shares."""
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import multiprocessing
-import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from scipy.stats import binomtest
+
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import whole
 
-__all__ = [
-    "INSIDE", "KINDS", "add_kinds", "as_curve", "from_checkout", "print_shares", "read_rows", "run", "share",
-    "write_rows",
-]  # fmt: skip
+__all__ = ["INSIDE", "KINDS", "add_kinds", "as_curve", "print_shares", "read_rows", "run", "share", "write_rows"]
 
 Row = dict[str, Any]
 KINDS = ("clean", "outside", "pair", "single")  # of what is hidden; outside: what the library does not have
@@ -31,17 +31,6 @@ def add_kinds(parser: argparse.ArgumentParser, what: str) -> None:
         "--kinds", nargs="+", choices=KINDS, default=list(KINDS), metavar="KIND",
         help=f"draw only {what} of these kinds: {', '.join(KINDS)} (default: all)",
     )  # fmt: skip
-
-
-def from_checkout(names: Iterable[str], needed: str) -> tuple[Any, ...]:
-    """Modules that stand under ``tests`` in a checkout; InputError says what is ``needed`` where there is none."""
-    root = str(Path(__file__).resolve().parents[2])  # the checkout, where this is one
-    if root not in sys.path:
-        sys.path.append(root)
-    try:
-        return tuple(importlib.import_module(n) for n in names)
-    except ImportError:
-        raise InputError(f"{needed}: run it from a checkout of the repository") from None
 
 
 def run(
@@ -75,9 +64,6 @@ def run(
 
 def write_rows(path: Path, rows: list[Row]) -> None:
     """Write rows as a Parquet file; what a row does not say is null."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     names = dict.fromkeys(name for row in rows for name in row)
     with whole(path) as part:
         pq.write_table(pa.table({n: [row.get(n) for row in rows] for n in names}), part)
@@ -85,8 +71,6 @@ def write_rows(path: Path, rows: list[Row]) -> None:
 
 def read_rows(path: Path, what: str) -> list[Row]:
     """Rows of an earlier run; InputError where the file is no result of ``what``."""
-    import pyarrow.parquet as pq
-
     try:
         return pq.read_table(path).to_pylist()
     except Exception as e:
@@ -102,8 +86,6 @@ def as_curve(law: Any, value: Callable[[Any], Any], forms: Iterable[str]) -> Row
              do not tell, a constant or a slope, is taken as the truth has it.
     formula  whether one of ``forms`` is among those given; None: the truth has no formula
     """
-    import numpy as np
-
     weight = np.interp(law.x, 0.5 * (law.edges[1:] + law.edges[:-1]), law.visited)
     visited = weight > 0.0
     x, w = law.x[visited], weight[visited]
@@ -120,8 +102,6 @@ def as_curve(law: Any, value: Callable[[Any], Any], forms: Iterable[str]) -> Row
 
 def share(hits: list[bool]) -> dict[str, Any]:
     """A share with its 90 % binomial interval (Wilson)."""
-    from scipy.stats import binomtest
-
     n, k = len(hits), sum(hits)
     low, high = binomtest(k, n).proportion_ci(0.90, "wilson") if n else (0.0, 1.0)
     return {"share": k / n if n else None, "low": float(low), "high": float(high), "hits": k, "of": n}

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,16 +21,14 @@ from vaneloop.identification.candidates.spline_basis import basis_of
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
+from vaneloop.identification.unmodelled.learned_law import LearnedLaw
 from vaneloop.identification.unmodelled.regressors import Quantity
 from vaneloop.identification.user_models.hysteresis_regressors import is_memory
 from vaneloop.identification.user_models.terms import COLUMN
 from vaneloop.identification.vane_chain.candidates import remade
+from vaneloop.identification.vane_chain.chain import Chain
 from vaneloop.identification.vane_chain.parameters import ALL_PLACES
 from vaneloop.identification.vane_chain.subsystem_data import Made
-
-if TYPE_CHECKING:
-    from vaneloop.identification.unmodelled.learned_law import LearnedLaw
-    from vaneloop.identification.vane_chain.chain import Chain
 
 __all__ = ["as_a_curve", "like_it", "with_effect"]
 

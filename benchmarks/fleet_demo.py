@@ -1,7 +1,10 @@
-"""A fleet of simulated engines whose truth is known: two years of logs by the independent rig (tests/rig)."""
+"""``python -m benchmarks.fleet_demo``: a fleet of simulated engines whose truth is known, two years of logs by the
+independent rig (tests/rig).
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
 import multiprocessing
 from collections.abc import Callable
@@ -11,10 +14,29 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from vaneloop.base.files import whole, write
-from vaneloop.cli.blind import from_checkout
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
-__all__ = ["fate", "make"]
+from benchmarks import start
+from tests import rig
+from tests.firmware_on_rig import firmware
+from tests.rig import parameters
+from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
+from vaneloop.base.files import whole, write
+from vaneloop.cli.fleet import unusable
+
+__all__ = ["DESCRIPTION", "YEAR", "YEARS", "add_options", "command", "fate", "make", "size_at"]
+
+DESCRIPTION = """Logs of a simulated fleet whose truth is known, to try `vaneloop fleet` with. The independent rig
+simulates two years of each engine; truth.json says what befell it. One is badly rigged, one has a sensor exchanged, a
+quarter of the others wears, a fifth has a drifting null. What is in the folder already stays.
+
+examples:
+  python -m benchmarks.fleet_demo --engines 4 --logs 20 --duration 60 --out out/fleet_logs
+
+exit codes: 0 done, 2 bad input"""
 
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
 YEARS = 2.0
@@ -28,16 +50,21 @@ FATES = {
 }
 
 
-def _rig() -> Any:
-    return from_checkout(("tests.rig", "tests.firmware_on_rig", "tests.rig.parameters"), "fleet demo needs the rig")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--out", required=True, metavar="DIR", help="folder of the logs; what is there stays")
+    parser.add_argument("--engines", type=int, default=40, metavar="N", help="number of engines (default 40)")
+    parser.add_argument("--logs", type=int, default=2000, metavar="N", help="logs of all together (default 2000)")
+    parser.add_argument("--duration", type=float, default=60.0, metavar="S", help="length of a log (default 60 s)")
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="seed of the draw (default 1)")
+    parser.add_argument("--workers", type=int, default=2, metavar="N", help="logs simulated side by side (default 2)")
+    terminal.add_output_options(parser)
 
 
 def fate(seed: int, engine: int, engines: int) -> dict[str, Any]:
     """What befalls an engine: one is badly rigged, one has a sensor exchanged, of the others a quarter wears and a
     fifth has a drifting null; the rest is healthy. Onsets are in the first 70 % of the time.
     """
-    import numpy as np
-
     rng = np.random.default_rng([seed, engine])
     others = max(engines - 2, 1)
     if engine == 0:
@@ -68,11 +95,6 @@ def size_at(truth: dict[str, Any], years: float) -> float:
 
 def _one(folder: str, seed: int, engines: int, each: int, duration: float, number: int) -> None:
     """Simulate one log of one engine, and write it where its engine and date are said by the path."""
-    import numpy as np
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    rig, on_rig, parameters = _rig()
     engine, k = divmod(number, each)
     truth = fate(seed, engine, engines)
     machine = np.random.default_rng(truth["specimen"])
@@ -90,7 +112,7 @@ def _one(folder: str, seed: int, engines: int, each: int, duration: float, numbe
         hidden = [rig.Hidden(truth["effect"], {effect.main: size, **effect.others, **stage})]
     draw = int(rng.integers(1, 2**31))
     run = rig.simulate(
-        rig.manoeuvre(draw, duration), on_rig.firmware(), hidden, seed=draw, rate=100, parameters=specimen,
+        rig.manoeuvre(draw, duration), firmware(), hidden, seed=draw, rate=100, parameters=specimen,
         geometry=geometry,
     )  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -104,7 +126,6 @@ def make(
     """Write ``logs`` logs of ``engines`` engines, and the truth beside them; what is there already stays. Return the
     file of the truth.
     """
-    _rig()
     each = -(-logs // engines)
     folder.mkdir(parents=True, exist_ok=True)
     truth = {"seed": seed, "begin": BEGIN.isoformat(), "engines": [fate(seed, e, engines) for e in range(engines)]}
@@ -116,3 +137,25 @@ def make(
             job.result()
             progress(done / len(jobs))
     return folder / "truth.json"
+
+
+def command(args: argparse.Namespace) -> int:
+    """Run from parsed options; return the exit code."""
+    if not 4 <= args.logs <= 100_000:
+        raise InputError(f"--logs (={args.logs}) must be in [4, 100000]")
+    if not 4 <= args.engines <= args.logs:
+        raise InputError(f"--engines (={args.engines}) must be in [4, {args.logs}], no more than --logs")
+    if not 1 <= args.workers <= 64:
+        raise InputError(f"--workers (={args.workers}) must be in [1, 64]")
+    if not 30.0 <= args.duration <= 1e5:
+        raise InputError(f"--duration (={args.duration:g} s) must be in [30, 1e5]")
+    with unusable(), terminal.progress_bar(args, "simulating the fleet") as progress:
+        truth = make(Path(args.out), args.engines, args.logs, args.duration, args.seed, args.workers,
+                     progress or (lambda fraction: None))  # fmt: skip
+    terminal.say(args, f"truth: {truth}; next: vaneloop fleet run {args.out} --out RUN")
+    terminal.write_json(args, {"schema": 1, "truth": str(truth)})
+    return 0
+
+
+if __name__ == "__main__":
+    start.run("benchmarks.fleet_demo")

@@ -1,27 +1,44 @@
-"""``vaneloop hidden-effect``: the blind benchmark. The rig hides an effect, the diagnosis sees the log only, and every
-answer is counted.
-
-The rig (``tests/rig``) is an independent simulator with other equations; it is part of a checkout, not of the installed
-package.
+"""``python -m benchmarks.hidden_effect``: the blind benchmark. The rig (``tests/rig``), an independent simulator with
+other equations, hides an effect, the diagnosis sees the log only, and every answer is counted.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import secrets
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from benchmarks import start
+from benchmarks.blind import INSIDE, KINDS, add_kinds, as_curve, print_shares, read_rows, run, share
+from benchmarks.same_curve import as_a_curve
+from hil.logs import Channel, read_log, write_log
+from hil.loop.lockstep import warm_up
+from plant import Model, build_plant
+from plant.effects import EFFECTS
+from tests import rig
+from tests.firmware_on_rig import firmware
+from tests.rig.left_out import LEFT_OUT
 from vaneloop.base import terminal
 from vaneloop.base.durations import named_lag, within_no_period
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
-from vaneloop.cli.blind import INSIDE, KINDS, add_kinds, as_curve, from_checkout, print_shares, read_rows, run, share
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.vane_chain.chain import build_chain
+from vaneloop.identification.vane_chain.experiment import recommend
+from vaneloop.identification.vane_chain.parameters import SHAPES
+from vaneloop.identification.workflow import diagnose, diagnosis_json
+from vaneloop.verbs.learn import learned
+from vaneloop.verbs.search import Diagnosed, not_given
 
 __all__ = ["DESCRIPTION", "add_options", "command", "draw_case", "judge_case", "summary"]
 
@@ -31,11 +48,11 @@ knowing only the log. Every machine's links are drawn within their tolerance; a 
 the controller is for some seconds in another mode.
 
 examples:
-  vaneloop hidden-effect --logs 40 --out out/blind.parquet
-  vaneloop hidden-effect --logs 200 --seed 12345 --out out/blind.parquet      (continues where it was stopped)
-  vaneloop hidden-effect --logs 60 --kinds outside clean --learn --out out/learned.parquet
-  vaneloop hidden-effect --logs 40 --leave-out --out out/left_out.parquet
-  vaneloop hidden-effect --plant tables/plant_electromechanical.toml --out out/motor.parquet
+  python -m benchmarks.hidden_effect --logs 40 --out out/blind.parquet
+  python -m benchmarks.hidden_effect --logs 200 --seed 12345 --out out/blind.parquet  (continues where it was stopped)
+  python -m benchmarks.hidden_effect --logs 60 --kinds outside clean --learn --out out/learned.parquet
+  python -m benchmarks.hidden_effect --logs 40 --leave-out --out out/left_out.parquet
+  python -m benchmarks.hidden_effect --plant tables/plant_electromechanical.toml --out out/motor.parquet
 
 exit codes: 0 done, 2 bad input. The figures are for reading; no threshold decides."""
 
@@ -85,11 +102,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     terminal.add_output_options(parser)
 
 
-def _rig() -> Any:
-    modules = ("tests.rig", "tests.firmware_on_rig", "tests.rig.left_out")
-    return from_checkout(modules, "hidden-effect needs the independent rig in tests/rig")
-
-
 def draw_case(
     seed: int, index: int, duration: float = 300.0, machine: str = "hydraulic", kinds: Sequence[str] = KINDS,
     leave_out: bool = False,
@@ -101,9 +113,6 @@ def draw_case(
     kinds    of `KINDS`, that are drawn
     leave_out  hide effects that can be left out of the library instead
     """
-    import numpy as np
-
-    rig, _, left_out = _rig()
     motor = machine == "electromechanical"
     library = list(rig.WITH_MOTOR if motor else rig.EFFECTS)
     outside = [k for k, e in rig.OUTSIDE.items() if not motor or e.stage != "actuator" or e.site == "lvdt"]
@@ -112,7 +121,7 @@ def draw_case(
     kind = str(rng.choice(KINDS, p=shares / shares.sum()))
     hidden = []
     if leave_out:
-        names = [name for name in left_out.LEFT_OUT if name in library]
+        names = [name for name in LEFT_OUT if name in library]
         kind, hidden = LEAVE_OUT, [rig.draw(str(rng.choice(names)), int(rng.integers(1, 5)), rng)]
     elif kind == "single":
         hidden = [rig.draw(str(rng.choice(library)), int(rng.integers(0, 5)), rng)]
@@ -147,9 +156,6 @@ def _intervals(hidden: list[Any], answer: dict[str, Any]) -> list[dict[str, Any]
     """True size of every hidden effect that was named, in border units, beside its interval (where both know the
     parameter).
     """
-    from plant.effects import EFFECTS
-
-    rig, *_ = _rig()
     out = []
     for h in hidden:
         named = next((e for e in answer["effects"] if e["effect"] == h.name), None)
@@ -168,20 +174,12 @@ def _intervals(hidden: list[Any], answer: dict[str, Any]) -> list[dict[str, Any]
 def _learned(chain: Any, d: Any, name: str, hidden: Any = None) -> dict[str, Any]:
     """What `learn` answers on the diagnosed log: each law with its rivals, formulas and errors.
 
-    hidden  an effect that was left out: is a law it (`vaneloop.cli.same_curve`)?
+    hidden  an effect that was left out: is a law it (`benchmarks.same_curve`)?
     """
-    import numpy as np
-
-    from plant import Model
-    from vaneloop.cli.same_curve import as_a_curve
-    from vaneloop.verbs.learn import learned
-    from vaneloop.verbs.search import Diagnosed
-
     started = time.process_time()
     answer = learned(chain, name, Model(), 1, None, Diagnosed(chain, d, name))
     spent = time.process_time() - started
-    *_, left_out = _rig()
-    names = left_out.LEFT_OUT[hidden.name].names(hidden) if hidden else []
+    names = LEFT_OUT[hidden.name].names(hidden) if hidden else []
     laws: list[dict[str, Any]] = [
         {"names": [law.name, *law.rivals], "formulas": [f.text for f in law.formulas], "before": law.error_before,
          "after": law.error_after, "found": any(n in names for n in (law.name, *law.rivals))}
@@ -190,7 +188,7 @@ def _learned(chain: Any, d: Any, name: str, hidden: Any = None) -> dict[str, Any
     for law, row in zip(answer.laws, laws, strict=True) if hidden else ():
         curve = as_a_curve(chain, law, hidden.name, _sizes(hidden), law.name == names[0])
         if curve is not None:
-            forms = left_out.LEFT_OUT[hidden.name].forms_of(law.name, hidden)
+            forms = LEFT_OUT[hidden.name].forms_of(law.name, hidden)
             row |= {"found": True, **as_curve(law, partial(np.interp, xp=law.x, fp=curve), forms)}
     return {"verdict": answer.verdict, "laws": laws, "notes": answer.notes, "why": answer.outcome.why,
             "nearest": answer.outcome.nearest, "steps": dict(answer.steps), "processor_s": spent}  # fmt: skip
@@ -198,17 +196,12 @@ def _learned(chain: Any, d: Any, name: str, hidden: Any = None) -> dict[str, Any
 
 def _named_where(effect: str, d: Any) -> set[str]:
     """Effects that a diagnosis names, with their rivals, in stages where ``effect`` shows."""
-    from plant.effects import EFFECTS
-
     shown = [s for s in d.stages if s.stage in EFFECTS[effect].stages]
     return {name for s in shown for f in s.effects for name in (f.effect, *f.rivals)}
 
 
 def _sizes(hidden: Any) -> dict[str, float]:
     """The sizes of what is hidden by the library's names, in its units; of one vane stage, by that stage."""
-    from plant.effects import EFFECTS
-
-    rig, *_ = _rig()
     main, which = rig.CATALOGUE[hidden.name].main, int(hidden.parameters.get("stage", -1))
     sizes = {VANES[which] if which >= 0 and k == main else k: v for k, v in hidden.parameters.items() if k != "stage"}
     return {k: v / EFFECTS[hidden.name][k].si for k, v in sizes.items()}
@@ -274,13 +267,6 @@ def learned_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _experiment(d: Any, chain: Any, case: dict[str, Any], test: Any, stages_of: Any) -> dict[str, Any] | None:
     """What the recommended experiment, run on the same machine, says of the rivals; None where there are none."""
-    from dataclasses import replace
-
-    import numpy as np
-
-    from vaneloop.identification.vane_chain.experiment import recommend
-    from vaneloop.identification.workflow import diagnose, diagnosis_json
-
     e = recommend(d, chain=chain)
     if e is None:
         return None
@@ -307,23 +293,13 @@ def judge_case(
     learn: bool = False, kinds: Sequence[str] = KINDS, leave_out: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Simulate, write, diagnose and score one log of a ``machine`` of `MACHINES`; a flat record."""
-    import numpy as np
-
-    from hil.logs import Channel, read_log, write_log
-    from plant import build_plant
-    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
-    from vaneloop.identification.vane_chain.chain import build_chain
-    from vaneloop.identification.workflow import diagnose, diagnosis_json
-    from vaneloop.verbs.search import not_given
-
-    rig, on_rig, _ = _rig()
     case = draw_case(seed, index, duration, machine, kinds, leave_out)
     plant, motor = build_plant(MACHINES[machine]), machine == "electromechanical"
     test = rig.manoeuvre(case["machine_seed"], duration)
 
     def stages_of(hidden: list[Any], test: Any = test) -> Any:
         run = rig.simulate(
-            test, on_rig.firmware(), hidden, seed=case["machine_seed"], rate=rate, geometry=case["geometry"],
+            test, firmware(), hidden, seed=case["machine_seed"], rate=rate, geometry=case["geometry"],
             gaps=case["gaps"],
             spells=case["modes"],
             motor=motor,
@@ -400,10 +376,6 @@ def _too_easy(effect: dict[str, Any]) -> bool:
     """Whether an effect was named improbable and without rival, or with a size on a bound that is not its neutral
     value.
     """
-    from plant import build_plant
-    from plant.effects import EFFECTS
-    from vaneloop.identification.vane_chain.parameters import SHAPES
-
     if effect["probability"] < LIKELY and not effect["rivals"]:
         return True
     if effect["effect"] not in EFFECTS:
@@ -563,8 +535,6 @@ def confusion(rows: list[dict[str, Any]]) -> list[list[str]]:
     """What was said of each hidden thing: a row a truth and an answer, with its count (answers: the names, none,
     unknown).
     """
-    from collections import Counter
-
     count: Counter[tuple[str, str]] = Counter()
     for r in rows:
         answers = r["named"] or [r["verdict"]]
@@ -603,10 +573,6 @@ def misses(rows: list[dict[str, Any]]) -> list[str]:
 
 def _machine(table: str) -> str:
     """Which of `MACHINES` a plant's table describes; InputError for one that the rig does not have."""
-    import numpy as np
-
-    from plant import build_plant
-
     plant = build_plant(table)
     if not np.array_equal(plant.p, build_plant(MACHINES[plant.kind]).p):
         raise InputError(
@@ -618,11 +584,6 @@ def _machine(table: str) -> str:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    import secrets
-
-    from hil.loop.lockstep import warm_up
-
-    _rig()
     if not 1 <= args.logs <= 100_000:
         raise InputError(f"--logs (={args.logs}) must be in [1, 100000]")
     if not 1 <= args.workers <= 64:
@@ -632,7 +593,7 @@ def command(args: argparse.Namespace) -> int:
     if args.seed is not None and not 0 <= args.seed < 2**63:
         raise InputError(f"--seed (={args.seed}) must be in [0, 2^63)")
     machine, path = _machine(args.plant), Path(args.out)
-    rows = read_rows(path, "hidden-effect") if path.exists() else []
+    rows = read_rows(path, "hidden_effect") if path.exists() else []
     seed = args.seed if args.seed is not None else (rows[0]["seed"] if rows else secrets.randbelow(2**31))
     if rows and "gaps" not in rows[0]:
         raise InputError(f"{path}: written by an older version, with one geometry for all; give another --out")
@@ -675,3 +636,7 @@ def command(args: argparse.Namespace) -> int:
         },
     )
     return 0
+
+
+if __name__ == "__main__":
+    start.run("benchmarks.hidden_effect")

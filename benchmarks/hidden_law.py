@@ -1,24 +1,36 @@
-"""``vaneloop hidden-law``: the blind benchmark for users' own models. An independent integrator hides laws in systems
-of many families, the diagnosis sees logs and a nominal model, and every answer is counted.
-
-The families (``tests/rig_systems``) and their nominal models (``tests/nominal_systems.py``) are part of a checkout, not
-of the installed package.
+"""``python -m benchmarks.hidden_law``: the blind benchmark for users' own models. An independent integrator hides laws
+in systems of many families (``tests/rig_systems``), the diagnosis sees logs and a nominal model
+(``tests/nominal_systems.py``), and every answer is counted.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import logging
+import secrets
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from benchmarks import start
+from benchmarks.blind import INSIDE, KINDS, add_kinds, as_curve, print_shares, read_rows, run, share
+from benchmarks.same_law import same_by_equations
+from tests import rig_systems as rig
+from tests.nominal_systems import nominal
+from tests.rig_systems import left_out
+from tests.rig_systems.surfaces import draw_surface
+from tests.system_variants import variants as variants_of
 from vaneloop.base import terminal
 from vaneloop.base.durations import within_no_period
-from vaneloop.cli.blind import INSIDE, KINDS, add_kinds, as_curve, from_checkout, print_shares, read_rows, run, share
-from vaneloop.cli.same_law import same_by_equations
+from vaneloop.base.errors import InputError
+from vaneloop.identification import Record
+from vaneloop.verbs import learn as learning
+from vaneloop.verbs import search
 
 __all__ = ["DESCRIPTION", "DETECTABLE", "add_options", "command", "judge_case", "misses", "summary"]
 
@@ -29,11 +41,11 @@ noisy logs, a test log and a nominal model whose parameters start off by up to t
 answers are judged.
 
 examples:
-  vaneloop hidden-law --systems 32 --seed 1 --out out/hidden_law.parquet
-  vaneloop hidden-law --systems 200 --seed 1 --out out/hidden_law.parquet      (continues where it was stopped)
-  vaneloop hidden-law --systems 32 --seed 1 --kinds outside clean --learn --out out/learned.parquet
-  vaneloop hidden-law --systems 32 --seed 1 --leave-out --out out/left_out.parquet
-  vaneloop hidden-law --systems 10 --seed 2 --family tanks --family pendulum --variants --out out/variants.parquet
+  python -m benchmarks.hidden_law --systems 32 --seed 1 --out out/hidden_law.parquet
+  python -m benchmarks.hidden_law --systems 200 --seed 1 --out out/hidden_law.parquet  (continues where it was stopped)
+  python -m benchmarks.hidden_law --systems 32 --seed 1 --kinds outside clean --learn --out out/learned.parquet
+  python -m benchmarks.hidden_law --systems 32 --seed 1 --leave-out --out out/left_out.parquet
+  python -m benchmarks.hidden_law --systems 10 --seed 2 --family tanks --family pendulum --variants --out out/v.parquet
 
 exit codes: 0 done, 2 bad input. The figures are for reading; no threshold decides."""
 
@@ -83,15 +95,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     terminal.add_output_options(parser)
 
 
-def _systems() -> Any:
-    """Modules of the families, the nominal models and the variants."""
-    names = (
-        "tests.rig_systems", "tests.nominal_systems", "tests.system_variants", "tests.rig_systems.left_out",
-        "tests.rig_systems.surfaces",
-    )  # fmt: skip
-    return from_checkout(names, "hidden-law needs the families of systems in tests/rig_systems")
-
-
 def _said(
     system: Any, records: list[Any], test: list[Any], floors: Any = None, truth: Any = None, true: Any = None
 ) -> dict[str, Any]:
@@ -101,15 +104,13 @@ def _said(
     truth   a law that is hidden as a curve (`tests.rig_systems.left_out.Truth`): what was learned is held against it
     true    the system with its true parameters
     """
-    from vaneloop.verbs import learn, search
-
     started = time.process_time()
     learned: dict[str, Any] = {}
     try:
         if floors is None:
             said = search.diagnose(records, system, test=test)
         else:
-            asked = learn.learn(records, system, test=test)
+            asked = learning.learn(records, system, test=test)
             said, learned = asked.diagnosed, _as_learned(asked, test[0].name, floors, truth, true)
         answer = terminal.plain(said.to_dict())
         out = {"verdict": answer["verdict"], "effects": answer["effects"], "answer": answer, "error": ""}
@@ -147,27 +148,22 @@ def judge_case(
     leave_out  hide a law of the library that is a function of one quantity, and take it out of the library
     surface    hide a law of two quantities in systems of even number, in the others nothing, or a law of one
     """
-    import logging
-
-    from vaneloop.identification import Record
-
     logging.getLogger("numba").setLevel(logging.ERROR)
-    rig, nominal, changes, left_out, surfaces = _systems()
     case = _left_out_case(seed, index, families) if leave_out else rig.draw_case(seed, index, families, kinds=kinds)
     both: tuple[str, ...] = ()
     if surface and index % 2 == 0:
-        case, both = surfaces.draw_surface(seed, index, families)
+        case, both = draw_surface(seed, index, families)
     elif surface:
         case = _case_of_one(seed, index, families)
     left = rig.left_over(case)
     records = [Record(f"log {k + 1}", log.t, case.columns(k)) for k, log in enumerate(case.logs)]
-    system, truth = nominal.nominal(case.family, case.values, case.factors), None
+    system, truth = nominal(case.family, case.values, case.factors), None
     if leave_out:
         (h,) = case.hidden
         system = replace(system, without=sorted(case.family.equivalent(h.name)))
         truth = left_out.truth_of(case.family, h, case.greatest.get(h.place, 1.0))
     floors = case.floors if learn or leave_out or surface else None
-    true = nominal.nominal(case.family, case.values, {})
+    true = nominal(case.family, case.values, {})
     said = _said(system, records[:-1], records[-1:], floors, truth, true)
     learned, effects, also = said["learned"], said["effects"], set()
     while leave_out and learned.get("verdict") == "named":  # another law says the same: it is left out, too
@@ -180,7 +176,7 @@ def judge_case(
         learned["also"] = sorted(also)
     tried: dict[str, Any] = {}
     if variants and not said["error"]:
-        for name, (system, fitted, test) in changes.variants(case, records, nominal.nominal):
+        for name, (system, fitted, test) in variants_of(case, records, nominal):
             other = _said(system, fitted, test)
             named = sorted(e["effect"] for e in other["effects"])
             same = (other["verdict"], named) == (said["verdict"], sorted(e["effect"] for e in said["effects"]))
@@ -212,9 +208,6 @@ def judge_case(
 
 def _case_of_one(seed: int, index: int, families: tuple[str, ...]) -> Any:
     """A system with nothing hidden, or a law outside the library that is a function of one quantity."""
-    import numpy as np
-
-    rig, *_ = _systems()
     rng = np.random.default_rng([seed, index, 3])
     family = str(rng.choice(families or list(rig.FAMILIES)))
     laws = [law for law in rig.FAMILIES[family].outside if rig.LEARNED.get((family, law))]
@@ -225,9 +218,6 @@ def _case_of_one(seed: int, index: int, families: tuple[str, ...]) -> Any:
 
 def _left_out_case(seed: int, index: int, families: tuple[str, ...]) -> Any:
     """A system with a law that can be left out of the library."""
-    import numpy as np
-
-    rig, _, _, left_out, _ = _systems()
     rng = np.random.default_rng([seed, index, 1])
     family = str(rng.choice(families or list(rig.FAMILIES)))
     law = str(rng.choice(left_out.laws_of(rig.FAMILIES[family])))
@@ -424,13 +414,11 @@ def misses(rows: list[Row]) -> list[str]:
 
 def _before(path: Path, families: tuple[str, ...]) -> list[Row]:
     """Rows of an earlier run with the same families."""
-    from vaneloop.base.errors import InputError
-
     if not path.exists():
         return []
-    rows = read_rows(path, "hidden-law")
+    rows = read_rows(path, "hidden_law")
     if any(not {"left", "variants", "families", "seed", "amounts"} <= set(r) for r in rows):
-        raise InputError(f"{path}: not a result of hidden-law (columns left, variants, families, amounts are needed)")
+        raise InputError(f"{path}: not a result of hidden_law (columns left, variants, families, amounts are needed)")
     if any(r["families"] != " ".join(families) for r in rows):
         was = rows[0]["families"] or "all"
         raise InputError(f"{path}: drawn from families {was}; allowed: the same --family, or another --out")
@@ -439,11 +427,6 @@ def _before(path: Path, families: tuple[str, ...]) -> list[Row]:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    import secrets
-
-    from vaneloop.base.errors import InputError
-
-    rig, *_ = _systems()
     for name in args.family:
         if name not in rig.FAMILIES:
             raise InputError(f"--family {name!r}: not a family; allowed: {', '.join(rig.FAMILIES)}")
@@ -505,3 +488,7 @@ def _print(args: argparse.Namespace, rows: list[Row]) -> None:
     terminal.print_table(args, "whole answers right", ["family", "right"], by_family(rows))
     for line in misses(rows):
         terminal.say(args, "miss " + line)
+
+
+if __name__ == "__main__":
+    start.run("benchmarks.hidden_law")
