@@ -11,7 +11,7 @@ import numpy as np
 
 from hil.bus.lockstep_bus import Channel
 from hil.bus.wire import BIT_RATE, BITS_PER_TICK, put, take
-from hil.logs.formats import FORMATS
+from hil.logs.formats import format_of
 from hil.logs.frames import Frames
 from hil.logs.recorder import Recorder
 from hil.loop.ecu import builtin
@@ -109,14 +109,4 @@ def by_wire(
 
 def write_frames(path: Path, frames: Frames) -> None:
     """Write frames as they are into a CAN log of any format."""
-    from hil.logs import asc, blf, candump, mdf, trc
-
-    writers = {
-        ".log": candump.write_candump,
-        ".asc": asc.write_asc,
-        ".blf": blf.write_blf,
-        ".trc": trc.write_trc,
-        ".mf4": mdf.write_bus,
-    }
-    assert set(writers) == set(FORMATS) - {".csv", ".parquet"}
-    writers[path.suffix](path, frames)
+    format_of(path).write_frames(path, frames)

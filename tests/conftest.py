@@ -164,7 +164,7 @@ def quick_child() -> Iterator[Callable[[bytes, float], bytes]]:
     if not hasattr(os, "fork"):
         pytest.skip("needs fork")
     code = (
-        "import os, sys, signal\nimport asammdf\nfrom hil.logs.mdf import answer\n"
+        "import os, sys, signal\nimport asammdf\nfrom hil.logs.mdf_child import answer\n"
         "for line in sys.stdin.buffer:\n"
         "    name, _, request = line.partition(b' ')\n"
         "    pid = os.fork()\n"

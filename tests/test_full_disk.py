@@ -24,8 +24,10 @@ import pytest
 
 from benchmarks import blind
 from hil.calibrate import elements, prepare
-from hil.logs import Channel, LogError, log, read_log, write_log
-from hil.logs.recorder import SUFFIXES, Recorder, read_record
+from hil.logs import Channel, LogError, read_log, write_log
+from hil.logs.formats import FORMATS
+from hil.logs.recorder import Recorder
+from hil.logs.recordings import read_record
 from hil.native import black_box, crash_log
 from hil.native.black_box import Box
 from hil.uds import TroubleMemory
@@ -325,7 +327,7 @@ CHANNELS = {
 }
 
 
-@pytest.mark.parametrize("suffix", [*log.FORMATS, pytest.param(".mf4 of frames", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("suffix", [*FORMATS, pytest.param(".mf4 of frames", marks=pytest.mark.slow)])
 def test_a_log_of_every_format(suffix: str, tmp_path: Path) -> None:
     file, _, frames = (tmp_path / f"a{suffix}").as_posix().partition(" ")
     dbc = ROOT / "tables" / "vgv.dbc" if frames else None
@@ -336,7 +338,7 @@ def test_a_log_of_every_format(suffix: str, tmp_path: Path) -> None:
     assert read_log(file).channels["n_dem"].values[-1] == pytest.approx(CHANNELS["n_dem"].values[-1], abs=0.1)
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", [s for s, f in FORMATS.items() if f.recorder])
 @pytest.mark.parametrize("room", [0, 50, 700, 3000, 9000, 40_000])
 def test_a_recording_on_a_full_disk_is_whole(suffix: str, room: int, tmp_path: Path) -> None:
     """What was appended before is in the file, and nothing of what did not fit; an earlier recording is there."""

@@ -21,7 +21,7 @@ from hil.logs.dbc import _load_dbc, _without
 from hil.logs.formats import FORMATS
 from hil.logs.mapping import read_mapping
 from hil.logs.names import is_time, lacks, meaning, unit_behind, unit_in_name, unit_kind
-from hil.logs.recorder import read_record
+from hil.logs.recordings import read_record
 from hil.logs.source import Options
 from hil.logs.survey import survey
 from hil.logs.table import split_unit
@@ -96,7 +96,7 @@ def look(path: Path) -> object:
 def columns_of(path: Path) -> object:
     """A bus log with the hostile file as its database."""
     _load_dbc.cache_clear()
-    return open_bus_log(FORMATS[".blf"].frames(ROOT / "examples" / "engine_run.blf"), Options(path, {}))  # type: ignore[misc]
+    return open_bus_log(FORMATS[".blf"].read_frames(ROOT / "examples" / "engine_run.blf"), Options(path, {}))
 
 
 ROWS = "".join(f"{k / 100},{50 + k % 7},{k % 5}\n" for k in range(20))

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hil.logs import LogError, read_log
 from hil.logs.guess import ENOUGH, contradictions
 from hil.logs.mapping import Bench, read_mapping, write_mapping
-from hil.logs.mdf import write_groups
+from hil.logs.mdf_write import write_groups
 from hil.logs.names import is_time, meaning
 from hil.logs.survey import sparkline, survey
 from tests.conftest import ROOT, examples

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 
 from hil.logs import Channel, LogError, plausible, read_log, write_log
-from hil.logs.asc import read_asc, write_asc
-from hil.logs.blf import read_blf, write_blf
+from hil.logs.asc import read_asc
+from hil.logs.blf import read_blf
 from hil.logs.bus_log import Bus, encode_channels
 from hil.logs.candump import read_candump, write_candump
 from hil.logs.dbc import MAX_DBC, Message, load_dbc
@@ -28,7 +28,8 @@ from hil.logs.frames import EXTENDED, Frames, in_order
 from hil.logs.signals import crc_table, cut_raw, cut_signal, e2e_crc, encode, pgn, select
 from hil.logs.source import Options
 from hil.logs.text_lines import match_lines
-from hil.logs.trc import read_trc, write_trc
+from hil.logs.through_can import write_asc, write_blf, write_trc
+from hil.logs.trc import read_trc
 from vaneloop.base import tables
 
 DBC = tables.path("vgv.dbc")

@@ -30,25 +30,18 @@ import pytest
 from asammdf.blocks.v4_blocks import SourceInformation
 from asammdf.blocks.v4_constants import BUS_TYPE_CAN, SOURCE_BUS
 
-from hil.logs import Channel, LogError, mdf, read_log, record_formats, recorder
+from hil.logs import Channel, LogError, formats, mdf, mdf_child, mdf_write, read_log, recorder, through_can, write_log
 from hil.logs.dbc import load_dbc
 from hil.logs.frames import EXTENDED, Frames
 from hil.logs.held import answers, held, phase_of_ticks, taken, time_on_wire
-from hil.logs.record_formats import (
-    ERROR,
-    FD,
-    FRAME,
-    REMOTE,
-    CandumpRecord,
-    MdfRecord,
-    append_whole,
-    messages,
-    packed_message,
-)
+from hil.logs.mdf_write import MdfRecord
+from hil.logs.record_formats import ERROR, FD, FRAME, REMOTE, CandumpRecord, append_whole, packed_message
 from hil.logs.record_parquet import ParquetRecord, _thrift_read, _thrift_write, read_parquet
-from hil.logs.recorder import FLUSH, Recorder, check_name, free_name, read_record
+from hil.logs.recorder import FLUSH, Recorder, check_name, free_name
+from hil.logs.recordings import read_record
 from hil.logs.signals import encode
 from hil.logs.source import Options
+from hil.logs.through_can import messages
 from vaneloop.base.child import python, python_module
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path as table_path
@@ -199,7 +192,7 @@ def test_a_blf_recording_s_header_counts_what_is_there_after_every_append(tmp_pa
 
 
 def test_what_a_writer_sees_of_a_long_file_reads_and_seeks_as_a_file() -> None:
-    tail = record_formats._Tail(bytes(range(144)), 1000)
+    tail = through_can._Tail(bytes(range(144)), 1000)
     assert tail.readable() and tail.writable() and tail.seekable() and tail.tell() == 0
     assert (
         tail.read(3) == b"\0\1\2" and tail.tell() == 3 and tail.read() == bytes(range(3, 144)) and tail.read(5) == b""
@@ -558,7 +551,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, tuple[int, int]]]:
 
     def child(request: bytes, seconds: float) -> bytes:
         out = io.BytesIO()
-        mdf.answer(request, out)
+        mdf_child.answer(request, out)
         limits.append((-1, (int(seconds), 0)))
         return out.getvalue()
 
@@ -569,7 +562,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, tuple[int, int]]]:
 
 def test_the_reader_of_mdf_bounds_its_time_and_its_memory(tmp_path: Path, here: list[Any]) -> None:
     file = tmp_path / "a.mf4"
-    mdf.write_groups(file, [(np.arange(3.0), {"n_dem": (np.arange(3.0), "%")})])
+    mdf_write.write_groups(file, [(np.arange(3.0), {"n_dem": (np.arange(3.0), "%")})])
     size = 2_500_000
     with file.open("ab") as f:
         f.write(bytes(size - file.stat().st_size))
@@ -641,14 +634,14 @@ def test_frames_of_a_bus_log_are_those_that_were_written(tmp_path: Path, here: l
         data[k, :length] = k + 1
     ident = np.where(np.arange(n) % 2, np.uint32(EXTENDED | 5), np.uint32(0x7FF)).astype(np.uint32)
     given = Frames(0.5 * np.arange(n), ident, np.zeros(n, np.int32), np.array(LENGTHS, np.uint8), data)
-    mdf.write_bus(tmp_path / "a.mf4", given)
+    mdf_write.write_bus(tmp_path / "a.mf4", given)
     content, got = mdf.read_mdf(tmp_path / "a.mf4", ["n_dem"])
     assert got is not None and content["names"] == {} and got.notes == []
     for of in ("t", "ident", "length", "data"):
         assert np.array_equal(getattr(got, of), getattr(given, of)), of
     assert (got.bus == 1).all()
     small = Frames(given.t[:9], ident[:9], given.bus[:9], given.length[:9], data[:9, :8])
-    mdf.write_bus(tmp_path / "b.mf4", small)
+    mdf_write.write_bus(tmp_path / "b.mf4", small)
     assert np.array_equal(mdf.read_mdf(tmp_path / "b.mf4", [])[1].data, small.data)  # type: ignore[union-attr]
     seen = list(can.LogReader(tmp_path / "a.mf4"))
     assert [bytes(m.data) for m in seen] == [d[:k].tobytes() for d, k in zip(data, LENGTHS, strict=True)]
@@ -758,7 +751,7 @@ def test_an_answer_goes_to_standard_output_and_nothing_that_a_library_prints(
         os.write(1, b"a library prints")
         out.write(b"answer to " + request)
 
-    monkeypatch.setattr(mdf, "answer", answer)
+    monkeypatch.setattr(mdf_child, "answer", answer)
     monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=io.BytesIO(b"one line\nanother")))
     kept, errors = os.dup(1), os.dup(2)
     try:
@@ -766,7 +759,7 @@ def test_an_answer_goes_to_standard_output_and_nothing_that_a_library_prints(
             file = os.open(tmp_path / name, os.O_WRONLY | os.O_CREAT)
             os.dup2(file, fd)
             os.close(file)
-        mdf.serve()
+        mdf_child.serve()
     finally:
         os.dup2(kept, 1)
         os.dup2(errors, 2)
@@ -788,7 +781,7 @@ def test_a_child_that_fails_or_takes_too_long_has_no_answer(monkeypatch: pytest.
     monkeypatch.setattr(subprocess, "run", run)
     assert [mdf._child(json.dumps({}).encode(), s) for s in (1.0, 2.0, 3.0)] == [b"", b"said", b""]
     command, options = asked[0]
-    assert command == python("from hil.logs.mdf import serve; serve()")
+    assert command == python("from hil.logs.mdf_child import serve; serve()")
     assert options["input"] == b"{}" and options["check"] is False
     assert options["env"]["OPENBLAS_NUM_THREADS"] == "1"
 
@@ -870,11 +863,11 @@ def test_mdf_is_written_as_groups_of_one_raster_and_as_frames_where_a_database_i
         "state": Channel(t, np.full(5, 2.0)),
         "p_s": Channel(t[::2], 21.0 + t[::2]),
     }
-    mdf.write_mdf(tmp_path / "a.mf4", channels, None)
+    mdf_write.write_mdf(tmp_path / "a.mf4", channels, None)
     with asammdf.MDF(tmp_path / "a.mf4") as got:
         assert [[c.name for c in g.channels][1:] for g in got.groups] == [["n_dem", "state"], ["p_s"]]
         assert (got.get("n_dem").unit, got.get("state").unit) == ("%", "")
-    mdf.write_mdf(tmp_path / "b.mf4", channels, table_path("vgv.dbc"))
+    mdf_write.write_mdf(tmp_path / "b.mf4", channels, table_path("vgv.dbc"))
     assert {m.arbitration_id for m in can.LogReader(tmp_path / "b.mf4")} == {0x0A0, 0x0B0, 0x0B3}
 
 
@@ -900,7 +893,7 @@ def test_an_mdf_of_frames_is_seen_through_a_database_unless_its_channels_are_ask
 
     assert kind(None, {}) == "signal" and kind(None, {"speed": "n_dem"}) == "channel"
     assert kind(table_path("vgv.dbc"), {"speed": "n_dem"}) == "signal"
-    mdf.write_groups(tmp_path / "a.mf4", [(n, {"x": (n, "")})])
+    mdf_write.write_groups(tmp_path / "a.mf4", [(n, {"x": (n, "")})])
     assert kind(table_path("vgv.dbc"), {}) == "channel"
 
 
@@ -920,8 +913,9 @@ def test_the_extra_that_reads_mdf_is_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, here: list[Any]
 ) -> None:
     asked: list[tuple[str, ...]] = []
-    monkeypatch.setattr(mdf, "needs", lambda *what: asked.append(what))
-    mdf.write_mdf(tmp_path / "a.mf4", {"n_dem": Channel(np.arange(2.0), np.arange(2.0))}, None)
+    for module in (mdf, formats):
+        monkeypatch.setattr(module, "needs", lambda *what: asked.append(what))
+    write_log(tmp_path / "a.mf4", {"n_dem": Channel(np.arange(2.0), np.arange(2.0))})
     mdf.read_mdf(tmp_path / "a.mf4", [])
     assert asked == [(f"{tmp_path / 'a.mf4'}: MDF4", "asammdf")] * 2
 
@@ -986,7 +980,7 @@ def test_a_recorder_that_is_closed_ends_its_file_and_asks_for_an_extra_for_mdf_o
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
-    monkeypatch.setattr(recorder, "needs", lambda what, _: asked.append(what))
+    monkeypatch.setattr(formats, "needs", lambda what, _: asked.append(what))
     for suffix in (".log", ".mf4"):
         to: Any = Recorder(tmp_path / f"a{suffix}")
         to.put(frames(2).tobytes())

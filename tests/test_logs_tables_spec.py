@@ -14,12 +14,13 @@ import pytest
 
 from hil.logs import Channel, Log, LogError, csv_format, offered, read_log, source, write_log
 from hil.logs import log as logs
+from hil.logs.dates import from_dates
 from hil.logs.mapping import Bench, read_mapping, write_mapping
 from hil.logs.opening import open_log
 from hil.logs.source import ABSENT, check_file, close_names, is_absent, names_held, numbers, read_bytes
 from hil.logs.survey import MOST_LISTED, Row, Survey, sparkline, survey
 from hil.logs.table import NoTime, split_unit
-from hil.logs.times import from_dates, guess_column, guess_unit
+from hil.logs.times import guess_column, guess_unit
 from hil.logs.units import USUAL_UNITS, Units, factor_of
 from vaneloop.base.signals import UNITS
 

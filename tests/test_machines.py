@@ -18,6 +18,7 @@ from controller.records import STATE, state_rows
 from hil.bus import frames
 from hil.bus.frames import VGV_ANGLES, VGV_ANGLES_2, VGV_ANGLES_3, VGV_HEALTH, VGV_SERVO, VGV_STATUS
 from hil.logs import Channel, LogError, read_log, write_log
+from hil.logs.formats import FORMATS
 from hil.loop.lockstep import Stimulus, lockstep, snapshot_names
 from hil.loop.node import Ecu, Node
 from plant import Model, build_plant, chain, load_geometry
@@ -204,7 +205,7 @@ def test_frames_under_an_identifier_that_only_greater_machines_use_are_others(ma
 
 
 @pytest.mark.parametrize("n", [1, 4, 8])
-@pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".trc", ".mf4", ".csv", ".parquet"])
+@pytest.mark.parametrize("suffix", FORMATS)
 def test_logs_of_every_format_hold_the_machine_s_stages(made: Any, tmp_path: Path, suffix: str, n: int) -> None:
     plant, calibration = made(n)
     columns = lockstep(STIMULUS, plant=plant, calibration=calibration, duration=2.0, hashed=False).columns

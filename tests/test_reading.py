@@ -18,11 +18,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import hil.logs.mdf
 from hil.logs import Channel, Log, LogError, offered, plausible, read_log, write_log
 from hil.logs.candump import write_candump
 from hil.logs.dbc import load_dbc
 from hil.logs.frames import Frames
+from hil.logs.mdf_write import write_bus, write_groups
 from hil.logs.signals import encode
 from hil.loop.ecu import read_profile
 from tests.conftest import ROOT, examples
@@ -263,7 +263,7 @@ def test_the_workbench_refuses_it_with_the_same_line(tmp_path: Path) -> None:
 
 # ---- time ------------------------------------------------------------------------------------------------------------
 
-FORMATS = [".csv", ".parquet", ".mf4", ".log", ".asc", ".blf", ".trc", "bus.mf4"]
+FORMATS = [".csv", ".parquet", ".mf4", ".log", ".asc", ".blf", ".trc", "bus.mf4"]  # that `write_stamped` writes
 _T0 = 1_735_000_000.0
 
 
@@ -283,7 +283,7 @@ def write_stamped(file: Path, t: np.ndarray) -> None:
         pq.write_table(pa.table({"t": t, "n_dem": n_dem}), file)
         return
     if suffix == ".mf4" and not file.name.startswith("bus"):
-        hil.logs.mdf.write_groups(file, [(t, {"n_dem": (n_dem, "%")})])
+        write_groups(file, [(t, {"n_dem": (n_dem, "%")})])
         return
     message = next(m for m in load_dbc(tables.path("vgv.dbc"))[0] if m.layout.name == "ECU_DEMAND")
     data = encode(message, {"n_dem": n_dem, "n_r": n_dem}, t.size)
@@ -291,7 +291,7 @@ def write_stamped(file: Path, t: np.ndarray) -> None:
         t, np.full(t.size, message.ident, np.uint32), np.zeros(t.size, np.int32), np.full(t.size, 8, np.uint8), data
     )
     if suffix == ".mf4":
-        hil.logs.mdf.write_bus(file, frames)
+        write_bus(file, frames)
     else:
         raw_writer(file, frames)
 

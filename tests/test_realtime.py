@@ -22,7 +22,8 @@ import pytest
 from hil.bus import frames
 from hil.bus.port import Port, open_bus
 from hil.logs import read_log
-from hil.logs.recorder import FRAME, Recorder, read_record
+from hil.logs.recorder import FRAME, Recorder
+from hil.logs.recordings import read_record
 from hil.loop.ecu import BUILTIN, Demand, EcuStation, Typed, builtin, read_profile
 from hil.loop.node import Ecu, Node, replay
 from hil.loop.realtime import TICK_NS, Lateness, Stop, Ticker, run_realtime, stop_on_signals, undisturbed

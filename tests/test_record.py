@@ -19,17 +19,18 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from hil.logs import read_log
+from hil.logs import formats, read_log
 from hil.logs.dbc import load_dbc
 from hil.logs.record_formats import ERROR, EXTENDED, FD, FRAME, REMOTE
-from hil.logs.recorder import Recorder, RecorderProcess, read_record
+from hil.logs.recorder import Recorder, RecorderProcess
+from hil.logs.recordings import read_record
 from hil.logs.signals import encode
 from tests.conftest import ROOT
 from tests.test_bus import broker_of
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path
 
-FORMATS = (".log", ".blf", ".mf4", ".parquet")
+FORMATS = [s for s, f in formats.FORMATS.items() if f.recorder]
 START = 1_700_000_000 * 10**9  # ns
 COMMAND = [sys.executable, "-m", "vaneloop.cli.main"]
 

@@ -21,7 +21,8 @@ from hil.bus.frames import ECU_DEMAND, VGV_STATUS
 from hil.bus.secoc import WINDOW, Authenticator, completed, read_key
 from hil.calibrate.station import replay_attended
 from hil.logs import read_log
-from hil.logs.recorder import Recorder, read_record
+from hil.logs.recorder import Recorder
+from hil.logs.recordings import read_record
 from hil.loop.node import Ecu, Node
 from hil.loop.realtime import TICK_NS, run_realtime
 from hil.loop.secured import BEHIND, DEMANDED, FROM_CONTROLLER, HOLD, MOST_WAITING, Gate, Secured, started

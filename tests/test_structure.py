@@ -96,7 +96,10 @@ EXPORTS: dict[str, list[str]] = {
     "hil.fmu": ["is_made", "write_fmu"],
     "hil.native": ["Program"],
     "hil.uds": ["Server", "TroubleMemory"],
-    "hil.logs": ["Channel", "Log", "LogError", "offered", "read_log", "write_log"],
+    "hil.logs": [
+        *("Channel", "Format", "Frames", "Log", "LogError", "Options", "Samples", "Series", "Source", "offered"),
+        *("read_log", "write_log"),
+    ],
     "plant": [
         "Geometry",
         "Model",

@@ -822,7 +822,7 @@ def states_in(record: Path) -> tuple[set[str], set[int]]:
     from controller import MODES
     from hil.bus.frames import IDENT_MASK
     from hil.logs import read_log
-    from hil.logs.recorder import read_record
+    from hil.logs.recordings import read_record
 
     state = read_log(record, require=("state",)).channels["state"].values
     return {MODES[int(v)] for v in state}, set((read_record(record).rows[:, 0] & IDENT_MASK).tolist())

@@ -293,7 +293,7 @@ class Babble(Outsider):
 class Replay(Outsider):
     """Old frames again, with their old spacing, over and over if ``loop``.
 
-    log            a CAN log (candump .log, .asc, .blf, .trc), or instead of it
+    log            a log that holds frames alone (candump, BLF, ...), or instead of it
     begin, length  s: what was on the bus in this run from ``begin`` on for ``length``
     frame          only this one
     """

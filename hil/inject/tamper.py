@@ -32,6 +32,7 @@ from hil.inject.actions import (
     identifier,
     raw_signal,
 )
+from hil.logs.formats import format_of
 from vaneloop.base.errors import InputError
 
 __all__ = ["Gateway", "Intruder", "tick_of"]
@@ -261,13 +262,8 @@ class Intruder:
 
 def _old_frames(action: Replay) -> tuple[dict[int, list[Words]], int]:
     """Return the frames of a CAN log by ms from its first, and the log's length in ms."""
-    from hil.logs.log import FORMATS
-
     path = Path(str(action.log))
-    readers = {suffix: f.frames for suffix, f in FORMATS.items() if f.frames is not None}
-    if path.suffix.lower() not in readers:
-        raise InputError(f"{path}: suffix {path.suffix!r} holds no frames to replay; allowed: {', '.join(readers)}")
-    log = readers[path.suffix.lower()](path)
+    log = format_of(path, "frames", "holds no frames to replay").read_frames(path)
     wanted = None if action.frame is None else identifier(action.frame)
     ms = np.rint(log.t * 1000.0).astype(int).tolist()
     out: dict[int, list[Words]] = {}

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.logs.frames import Frames, write_through_can
+from hil.logs.frames import Frames
 from hil.logs.source import LogError, read_bytes
 from hil.logs.text_lines import Part, join_parts, match_lines, part_of
 
-__all__ = ["read_asc", "write_asc"]
+__all__ = ["read_asc"]
 
 _ASC = re.compile(
     rb"(?P<s> *\d{1,10})\.(?P<f>\d{1,9})[ \t]+(?P<fd>CANFD[ \t]+)?(?P<bus>\d{1,4})[ \t]+(?(fd)\w+[ "
@@ -45,8 +45,3 @@ def read_asc(path: Path) -> Frames:
         place, since = np.array([e[0] for e in events]), np.cumsum([e[1] for e in events])
         parts = [(p[0], np.rint(since[np.searchsorted(place, p[0])] * 1e9).astype(np.int64), *p[2:]) for p in parts]
     return join_parts(path, parts, "ASC", "0.010000 1  A0  Rx  d 8 00 01 02 03 04 05 06 07", [])
-
-
-def write_asc(path: Path, frames: Frames) -> None:
-    """Write a Vector ASCII log."""
-    write_through_can(path, frames, "ASCWriter")

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.logs.frames import Frames, frames_in_order, write_through_can
+from hil.logs.frames import Frames, frames_in_order
 from hil.logs.source import LogError, read_bytes
 
-__all__ = ["read_blf", "unpacked", "whole_blf", "write_blf"]
+__all__ = ["read_blf", "unpacked", "whole_blf"]
 
 _OBJECT = struct.Struct("<4sHHII")  # signature, header size, header version, size, type
 _CONTAINER, _CAN, _CAN2, _FD, _FD64 = 10, 1, 86, 100, 101
@@ -168,8 +168,3 @@ def _blf_frames(stream: bytes, objects: np.ndarray, kind: int) -> Iterator[tuple
         ns = (ticks * step).astype(np.int64)
         fields = these[:, 0], ns, ident & np.uint32(0x9FFFFFFF), bus.astype(np.int32), length.astype(np.uint8), data
         yield tuple(f[keep] for f in fields)
-
-
-def write_blf(path: Path, frames: Frames) -> None:
-    """Write a Vector binary log."""
-    write_through_can(path, frames, "BLFWriter")

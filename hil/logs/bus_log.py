@@ -5,7 +5,6 @@ carry.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,10 @@ import numpy as np
 from hil.logs.dbc import Message, load_dbc
 from hil.logs.frames import Frames
 from hil.logs.signals import cut_signal, encode, pgn, select
-from hil.logs.source import Channel, LogError, Options, Series, Source, names_held
+from hil.logs.source import Channel, LogError, Options, Series, names_held
 from vaneloop.base import tables
 
-__all__ = ["Bus", "bus_reader", "bus_writer", "encode_channels", "open_bus_log"]
+__all__ = ["Bus", "encode_channels", "open_bus_log"]
 
 _MOST_FRAMES = 20_000_000  # of one message; 55 h at 10 ms
 _HOLD = 3  # frame periods a value is repeated on the bus before its channel counts as silent
@@ -78,15 +77,6 @@ class Bus:
         return Series(self.frames.t[rows], values, str(signal.unit or ""), framed=True)
 
 
-def bus_reader(read: Callable[[Path], Frames]) -> Callable[[Path, Options], Source]:
-    """Reader of a CAN log format: its frames, seen through the database."""
-
-    def open_bus(path: Path, options: Options) -> Source:
-        return open_bus_log(read(path), options)
-
-    return open_bus
-
-
 def open_bus_log(frames: Frames, options: Options) -> Bus:
     """Frames seen through the database that the user named, or the product's own."""
     dbc = options.dbc or tables.path("vgv.dbc")
@@ -103,22 +93,15 @@ def open_bus_log(frames: Frames, options: Options) -> Bus:
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-def bus_writer(write: Callable[[Path, Frames], None]) -> Callable[[Path, dict[str, Channel], Path | None], None]:
-    """Writer of a CAN log format: channels to the frames of the database, then these to the file."""
-
-    def write_bus(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
-        write(path, encode_channels(channels, dbc or tables.path("vgv.dbc"), path))
-
-    return write_bus
-
-
-def encode_channels(channels: dict[str, Channel], dbc: Path, path: Path) -> Frames:
-    """Frames as the nodes would send them: each message at its period, with the value then valid.
+def encode_channels(channels: dict[str, Channel], dbc: Path | None, path: Path) -> Frames:
+    """Frames of a database (default: the product's own) as the nodes would send them: each message at its period,
+    with the value then valid.
 
     A value is repeated until its channel's next sample, but no longer than `_HOLD` frame periods or steps of the
     channel: after that the signal says "not available", and a message without any value is not sent. i_cmd is the mean
     since the last frame.
     """
+    dbc = dbc or tables.path("vgv.dbc")
     messages, _ = load_dbc(dbc)
     start = min(float(c.t[0]) for c in channels.values())
     parts = []

@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+from pyarrow import csv as arrow
 
+from hil.logs.arrow import arrow_table
+from hil.logs.dates import from_dates
 from hil.logs.source import ABSENT, Channel, LogError, Options, Source, numbers, read_bytes, second
-from hil.logs.table import Table, arrow_table, split_unit, time_column
-from hil.logs.times import from_dates
+from hil.logs.table import Table, split_unit, time_column
 from hil.logs.units import NO_UNIT, factor_of
 from vaneloop.base.files import whole
 from vaneloop.base.signals import UNITS
@@ -111,8 +114,6 @@ class _Csv:
         self.text: Any = None  # the columns that are not ready, as words
 
     def column(self, header: str) -> np.ndarray:
-        import pyarrow as pa
-
         if _INK.search(self.raw, self.at) is None:
             return np.empty(0)
         if self.ready is None:
@@ -131,9 +132,6 @@ class _Csv:
         """The columns of ``columns`` as ``kind``. Rows with too many or too few cells are squared once, then read
         again.
         """
-        import pyarrow as pa
-        from pyarrow import csv as arrow
-
         places = [f"c{i}" for i in range(len(self.headers))]  # names of our own: the file's may be empty
         place = dict(zip(self.headers, places, strict=True))
         wanted = [place[h] for h in columns]
@@ -191,8 +189,6 @@ class _Csv:
         """A column whose cells are not all plain numbers: blanks are taken off, the first cell that is none is
         named.
         """
-        import pyarrow as pa
-
         try:
             if self.text is None:
                 ready = self.ready or {}
@@ -241,8 +237,6 @@ def _squared(rows: bytes, separator: str, cells: int) -> bytes:
 
 def write_csv(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
     """Write a CSV: t, then a column a channel on all times of all; an empty cell where a channel has no sample."""
-    from pyarrow import csv as arrow
-
     table = arrow_table(channels)
     with whole(path, LogError) as part, part.open("wb") as file:
         file.write(",".join(table.column_names).encode() + b"\n")  # Arrow would put quotes around every name

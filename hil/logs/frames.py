@@ -9,15 +9,13 @@ as the writers of the formats where speed matters less, and as the source of the
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 from hil.logs import plausible
 from hil.logs.source import LogError
-from vaneloop.base.files import whole
 
-__all__ = ["DISORDER_S", "EXTENDED", "Frames", "frames_in_order", "in_order", "write_through_can"]
+__all__ = ["DISORDER_S", "EXTENDED", "Frames", "frames_in_order", "in_order"]
 
 EXTENDED = 1 << 31  # flag in `Frames.ident`, as socketcan sets it
 DISORDER_S = 0.050  # loggers that merge several channels swap frames by a few ms; more is a clock that jumped
@@ -89,17 +87,3 @@ def frames_in_order(
     t, order = in_order(name, t, notes)
     t = t[order]
     return Frames(t - t[:1], ident[order], bus[order], length[order], data[order], notes)
-
-
-def write_through_can(path: Path, frames: Frames, writer: str) -> None:
-    """Write frames with the ``writer`` of python-can that has this name."""
-    import can
-
-    with whole(path, LogError) as part, getattr(can, writer)(str(part)) as out:
-        for t, i, n, data in zip(
-            frames.t.tolist(), frames.ident.tolist(), frames.length.tolist(), frames.data, strict=True
-        ):
-            message = can.Message(
-                round(t, 6), i & 0x1FFFFFFF, i >> 31 == 1, channel=0, data=data[:n].tobytes(), is_fd=n > 8
-            )
-            out.on_message_received(message)

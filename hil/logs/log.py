@@ -1,10 +1,9 @@
 """Measured runs: read any log into channels in the product's names and units, write channels into any log.
 
-A log is a CAN recording (`.log` of candump, `.asc`, `.blf`, `.trc`, bus-logging `.mf4`) with a DBC, MDF4 channel groups
-(`.mf4`), CSV or Parquet. Whatever it is, it ends as a `Log`: per signal the times, strictly increasing, in seconds from
-the start, and the values, finite, in the unit of docs/architecture.md. Each channel keeps its own raster; nothing is
-interpolated and gaps stay gaps. What cannot be used raises `LogError`, one line; what had to be left out is said in
-`Log.notes`. docs/logs.md is the user's page.
+A log is a file of any format of `hil.logs.formats`. Whatever it is, it ends as a `Log`: per signal the times, strictly
+increasing, in seconds from the start, and the values, finite, in the unit of docs/architecture.md. Each channel keeps
+its own raster; nothing is interpolated and gaps stay gaps. What cannot be used raises `LogError`, one line; what had to
+be left out is said in `Log.notes`. docs/logs.md is the user's page.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from hil.logs import plausible
-from hil.logs.formats import FORMATS, Format, format_of
+from hil.logs.formats import format_of
 from hil.logs.guess import Files, Guess
 from hil.logs.opening import is_ours, open_log, wanted_design_speed
 from hil.logs.source import ABSENT, Channel, LogError, Options, Series, Source, close_names, find, is_absent
@@ -25,7 +24,7 @@ from hil.logs.table import NoTime
 from hil.logs.units import Units
 from vaneloop.base.signals import UNITS
 
-__all__ = ["FORMATS", "Channel", "Format", "Log", "LogError", "offered", "read_log", "write_log"]
+__all__ = ["Channel", "Log", "LogError", "offered", "read_log", "write_log"]
 
 _EPOCH = 1e8  # s; a table whose time starts three years in counts from 1970, not from the start of the log
 
@@ -317,7 +316,7 @@ def offered(path: str | Path, *, dbc: str | Path | None = None) -> list[str]:
     """Names that a log offers and that ``mapping`` may name. Raises LogError for a file that is no log."""
     path = Path(path)
     try:
-        source = format_of(path).read(path, Options(Path(dbc) if dbc is not None else None, {}))
+        source = format_of(path).open(path, Options(Path(dbc) if dbc is not None else None, {}))
     except NoTime as e:
         return [h for h in e.headers if h]
     time = getattr(source, "time", None)  # a table's time column is a column like any other
@@ -347,7 +346,7 @@ def write_log(path: str | Path, channels: dict[str, Channel], *, dbc: str | Path
     LogError for a name that is no signal, a channel that is not one, a value that its frame cannot hold.
     """
     path = Path(path)
-    write = format_of(path).write
+    of = format_of(path)
     if not channels:
         raise LogError(f"{path}: no channel to write")
     checked = {}
@@ -362,4 +361,4 @@ def write_log(path: str | Path, channels: dict[str, Channel], *, dbc: str | Path
         if not (np.isfinite(t).all() and np.isfinite(values).all() and (np.diff(t) > 0).all()):
             raise LogError(f"{path}: {name}: samples must be finite and their times increasing")
         checked[name] = Channel(t, values)
-    write(path, checked, Path(dbc) if dbc is not None else None)
+    of.write(path, checked, Path(dbc) if dbc is not None else None)

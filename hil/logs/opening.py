@@ -109,7 +109,7 @@ def open_log(
     given = _pairs(path, mapping, signals)
     named = {**bench.names, **given}
     options = Options(Path(dbc) if dbc is not None else None, {name: signal for signal, name in named.items()}, guess)
-    source = format_of(path).read(path, options)
+    source = format_of(path).open(path, options)
     absent = {s: n for s, n in bench.names.items() if s not in given and s != "t" and not find(source, n, True)}
     for signal in absent:
         del named[signal]

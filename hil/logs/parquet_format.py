@@ -6,13 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
+from hil.logs.arrow import arrow_table
+from hil.logs.dates import from_dates
 from hil.logs.source import Channel, LogError, Options, Source, check_file, numbers, second
-from hil.logs.table import Table, arrow_table, time_column
-from hil.logs.times import from_dates
+from hil.logs.table import Table, time_column
 from vaneloop.base.files import whole
 
-__all__ = ["FRAME_COLUMNS", "open_parquet", "whole_parquet", "write_parquet"]
+__all__ = ["FRAME_COLUMNS", "open_parquet", "said_by_parquet", "whole_parquet", "write_parquet"]
 
 FRAME_COLUMNS = ("time", "id", "extended", "kind", "tx", "length", "bytes")  # of a table that has a row a frame
 
@@ -33,9 +36,6 @@ def whole_parquet(path: Path) -> Any:
 
     Raises LogError for what is none, and for one that says that it unpacks to more than its size is worth.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     size = check_file(path)
     try:
         file = pq.ParquetFile(path)
@@ -56,8 +56,6 @@ def whole_parquet(path: Path) -> Any:
 
 def open_parquet(path: Path, options: Options) -> Source:
     """Parquet with numeric columns; null = no sample there."""
-    import pyarrow as pa
-
     damage = pa.ArrowException, *_DAMAGE
     file = whole_parquet(path)
     schema = file.schema_arrow
@@ -103,10 +101,17 @@ def open_parquet(path: Path, options: Options) -> Source:
     return table
 
 
+def said_by_parquet(path: Path) -> dict[str, str]:
+    """What the metadata say of ``engine`` and ``time``; nothing where they cannot be read."""
+    try:
+        said = pq.read_metadata(path).metadata or {}
+    except (OSError, pa.ArrowException):
+        return {}
+    return {n: said[n.encode()].decode("utf-8", "replace") for n in ("engine", "time") if n.encode() in said}
+
+
 def write_parquet(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
     """Write a Parquet file: t, then a column a channel on all times of all; null where a channel has no sample."""
-    import pyarrow.parquet as pq
-
     table = arrow_table(channels)
     with whole(path, LogError) as part:
         pq.write_table(table, part, compression="zstd")

@@ -15,7 +15,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
+from hil.bus.frames import NOTE
 from hil.logs.dbc import load_dbc
 from hil.logs.frames import Frames
 from hil.logs.parquet_format import FRAME_COLUMNS, whole_parquet
@@ -24,6 +27,7 @@ from hil.logs.signals import cut_signal, select
 from hil.logs.source import LogError
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import whole
+from vaneloop.base.signals import UNITS
 from vaneloop.base.tables import path as table_path
 
 __all__ = ["ParquetRecord", "read_parquet"]
@@ -55,10 +59,6 @@ class ParquetRecord:
     MOST = 50_000  # rows of a group that is merged further, so that no merge takes longer than an append may
 
     def __init__(self, path: Path, channel: str):
-        import pyarrow as pa
-
-        from vaneloop.base.signals import UNITS
-
         self.path = path
         self.messages = [
             m for m in load_dbc(table_path("vgv.dbc"))[0] if any(s.name in UNITS for s in m.layout.signals)
@@ -80,8 +80,6 @@ class ParquetRecord:
         self._write([], self._rows(np.frombuffer(all_kinds.tobytes(), FRAME)).slice(0, 0), 0)
 
     def append(self, frames: np.ndarray) -> None:
-        import pyarrow as pa
-
         if self.start is None:
             self.start = int(frames["ns"][0])
         rows, level, keep, others = self._rows(frames), 0, list(self.groups), self.MERGE - 1
@@ -96,8 +94,6 @@ class ParquetRecord:
         self._write(keep, rows, level)
 
     def _rows(self, frames: np.ndarray) -> Any:
-        import pyarrow as pa
-
         ident, n = frames["ident"], len(frames)
         error, remote, fd = ident & ERROR != 0, ident & REMOTE != 0, frames["flags"] & FD != 0
         note = frames["note"] != 0
@@ -125,8 +121,6 @@ class ParquetRecord:
 
     def _write(self, keep: list[_Group], rows: Any, level: int) -> None:
         """Append a row group and the footer of what is kept and it, in one write."""
-        import pyarrow.parquet as pq
-
         end, part = os.lseek(self.fd, 0, os.SEEK_END), io.BytesIO()
         pq.write_table(
             rows, part, row_group_size=max(len(rows), 1), compression="zstd", write_statistics=False, store_schema=False
@@ -147,8 +141,6 @@ class ParquetRecord:
 
     def close(self) -> None:
         """Write the file anew without obsolete row groups and footers, and put it in place of the grown one."""
-        import pyarrow.parquet as pq
-
         os.close(self.fd)
         with (
             contextlib.suppress(InputError),  # no room for a second copy: the grown file is whole
@@ -164,8 +156,6 @@ _BATCH = 1 << 16  # frames
 
 def read_parquet(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time (us since 1970), both words (`hil.bus.frames`) and direction of each frame of a recording."""
-    from hil.bus.frames import NOTE
-
     names = list(FRAME_COLUMNS)
     file = whole_parquet(path)
     held = file.schema_arrow.names

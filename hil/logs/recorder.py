@@ -1,5 +1,5 @@
-"""Frames to a file that opens whenever the recording stops, also by ``kill -9``: candump, BLF, MDF4 or Parquet, by
-suffix.
+"""Frames to a file that opens whenever the recording stops, also by ``kill -9``, in each format that can be recorded
+to (`hil.logs.formats`).
 
 Twice a second what has come in is appended, each format in its own way such that the file is whole again afterwards
 (`hil.logs.record_formats`). A killed process loses nothing that it has handed to the kernel, so at most half a second
@@ -12,64 +12,35 @@ for a loop that must not wait for a disk; it ends the file properly even where t
 from __future__ import annotations
 
 import contextlib
-import io
+import fcntl
 import os
 import select
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hil.logs.blf import whole_blf
-from hil.logs.mdf import read_record_mdf
-from hil.logs.record_formats import (
-    ERROR,
-    FRAME,
-    NOTE_CHANNEL,
-    NOTE_NAME,
-    BlfRecord,
-    CandumpRecord,
-    FramesOfRecord,
-    MdfRecord,
-    RecordFormat,
-    frames_of,
-    packed_message,
-)
-from hil.logs.record_parquet import ParquetRecord, read_parquet
-from hil.logs.source import LogError, check_file
+from hil.logs.formats import format_of, spoken
+from hil.logs.record_formats import FRAME, packed_message
+from vaneloop.base import terminal
 from vaneloop.base.child import python_module
 from vaneloop.base.errors import InputError
-from vaneloop.base.extras import needs
 from vaneloop.base.files import cannot_write
 
-if TYPE_CHECKING:
-    import can
-
-__all__ = [
-    "FLUSH", "FRAME", "SUFFIXES", "Record", "Recorder", "RecorderProcess", "check_name", "free_name", "packed_message",
-    "read_record",
-]  # fmt: skip
+__all__ = ["FLUSH", "FRAME", "Recorder", "RecorderProcess", "check_name", "free_name", "packed_message"]
 
 FLUSH = 0.5  # s between two appends; at most this much is lost
 _END = b"\xff" * FRAME.itemsize  # in place of a frame: nothing comes after it; who forked may hold the pipe still
 _WHOLE = select.PIPE_BUF // FRAME.itemsize * FRAME.itemsize  # bytes that a pipe takes whole or not at all
-SUFFIXES: dict[str, Callable[[Path, str], RecordFormat]] = {
-    ".log": CandumpRecord,
-    ".blf": BlfRecord,
-    ".mf4": MdfRecord,
-    ".parquet": ParquetRecord,
-}
 
 
 class Recorder:
     """A recording into a file of this process: `put` frames as they come, `poll` now and then, `close` at the end.
 
-    path     .log (candump), .blf, .mf4 or .parquet; a file that is there already is kept under another name
+    path     its suffix says the format; a file that is there already is kept under another name
     channel  name of the bus, for candump
     """
 
@@ -77,7 +48,7 @@ class Recorder:
         self.path = check_name(path)
         empty, self.kept = self.path.is_file(), _keep_old(self.path)
         try:
-            self.file = SUFFIXES[self.path.suffix.lower()](self.path, channel)
+            self.file = format_of(self.path).record(self.path, channel)
         except OSError as e:
             with contextlib.suppress(OSError):  # what was begun goes, and the earlier recording has its name again
                 if self.kept:
@@ -126,11 +97,7 @@ class Recorder:
 def check_name(path: str | Path) -> Path:
     """Return the path of a recording if its name and folder allow one. Raises InputError."""
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        known = "candump (.log), BLF (.blf), MDF4 (.mf4) or Parquet (.parquet)"
-        raise InputError(f"{path}: suffix {path.suffix!r} is not one of a recording; allowed: {known}")
-    if path.suffix.lower() == ".mf4":
-        needs(f"{path}: MDF4", "asammdf")
+    format_of(path, "recorder", "is not one of a recording", spoken).check(path)
     if path.is_dir() or not path.parent.is_dir():
         raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'its folder does not exist'}")
     if not os.access(path if path.exists() else path.parent, os.W_OK):
@@ -153,69 +120,6 @@ def _keep_old(path: Path) -> Path | None:
     other = free_name(path)
     path.rename(other)
     return other
-
-
-@dataclass(frozen=True)
-class Record:
-    """Frames of a recording, in order: ms since 1970 (int64[n]), both words (int64[n, 2], `hil.bus.frames`), and
-    whether it sent them. Among them the notes of the loop (`hil.bus.frames.NOTE`).
-    """
-
-    ms: np.ndarray
-    rows: np.ndarray
-    sent: np.ndarray
-
-
-def _read_text(path: Path) -> FramesOfRecord:
-    """Frames of a text log."""
-    return frames_of(_messages(path), NOTE_NAME if path.suffix.lower() == ".log" else NOTE_CHANNEL)
-
-
-def _read_blf(path: Path) -> FramesOfRecord:
-    """Frames of a Vector binary log."""
-    import can
-
-    with can.BLFReader(io.BytesIO(whole_blf(path))) as reader:
-        return frames_of(reader, NOTE_CHANNEL)
-
-
-_READ: dict[str, Callable[[Path], FramesOfRecord]] = {
-    **dict.fromkeys((".log", ".asc", ".trc", ".csv"), _read_text), ".blf": _read_blf, ".mf4": read_record_mdf,
-    ".parquet": read_parquet,
-}  # fmt: skip
-
-
-def read_record(path: str | Path) -> Record:
-    """Read what a `Recorder` wrote, or another program in a format that python-can reads. Raises LogError."""
-    path = Path(path)
-    check_file(path)
-    if path.suffix.lower() not in _READ:
-        raise LogError(f"{path}: suffix {path.suffix!r} is not a recording's; allowed: {', '.join(_READ)}")
-    try:
-        us, rows, sent = _READ[path.suffix.lower()](path)
-    except InputError:
-        raise
-    except Exception as e:  # readers meet a damaged file with any exception there is
-        raise LogError(f"{path}: cannot be read as a recording of frames ({type(e).__name__}: {e})") from None
-    if not len(us):
-        raise LogError(f"{path}: no CAN frame in it")
-    order = np.argsort(us, kind="stable")
-    return Record(us[order] // 1000, rows[order], sent[order])
-
-
-def _messages(path: Path) -> Iterator[can.Message]:
-    """Give the frames of a text log. python-can takes most error frames of a candump log for data frames."""
-    import can
-
-    with can.LogReader(path) as reader:
-        if path.suffix.lower() != ".log":
-            yield from reader
-            return
-        with path.open() as file:
-            for message, line in zip(reader, (line for line in file if line.strip()), strict=True):
-                if int(line.split()[2].partition("#")[0], 16) & ERROR:
-                    message.is_error_frame, message.is_extended_id = True, False
-                yield message
 
 
 # --- in a process of its own ------------------------------------------------------------------------------------------
@@ -274,16 +178,12 @@ class RecorderProcess:
 
 
 def _enlarge(pipe: int, size: int = 1 << 20) -> None:
-    import fcntl
-
     with contextlib.suppress(OSError):  # an unprivileged user may be allowed less: 64 KiB are two seconds
         fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, size)
 
 
 def serve(path: str, channel: str) -> int:
     """Record what comes through standard input until it ends or says so, and say on standard output how that went."""
-    import signal
-
     for number in (
         signal.SIGINT,
         signal.SIGTERM,
@@ -320,6 +220,4 @@ def serve(path: str, channel: str) -> int:
 
 
 if __name__ == "__main__":
-    from vaneloop.base import terminal
-
     sys.exit(terminal.run(lambda: serve(*sys.argv[1:])))

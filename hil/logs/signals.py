@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from hil.logs.columns import cut, wrong_crc
 from hil.logs.dbc import Message
 from hil.logs.frames import EXTENDED, Frames
 from hil.logs.source import LogError
@@ -57,8 +58,6 @@ def select(frames: Frames, message: Message) -> tuple[np.ndarray, list[str]]:
         rows = rows[~short]
     if message.e2e is not None and rows.size:
         if message.layout.length == 8 and frames.data.shape[1] == 8:
-            from hil.logs.columns import wrong_crc
-
             wrong = np.empty(rows.size, bool)
             wrong_crc(frames.words, rows, _CRC, _CRC[_CRC[message.e2e & 0xFF] ^ (message.e2e >> 8)], wrong)
         else:
@@ -174,8 +173,6 @@ def _cut_integer(
     frames: Frames, rows: np.ndarray, message: Message, signal: Any, need: int
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """`cut_signal` for the common case: an integer that is in every frame of eight bytes."""
-    from hil.logs.columns import cut
-
     places, shift = _place(signal)
     big = len(places) > 1 and places[0] > places[1]
     shift += 8 * (7 - places[0] if big else places[0])

@@ -14,23 +14,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from vaneloop.base.errors import InputError
+from hil.logs.errors import LogError
 
 __all__ = [
-    "ABSENT", "Channel", "LogError", "Options", "Series", "Source", "check_file", "close_names", "find", "is_absent",
-    "names_held", "numbers", "read_bytes", "second",
+    "ABSENT", "Channel", "LogError", "Options", "Samples", "Series", "Source", "check_file", "close_names", "find",
+    "is_absent", "names_held", "numbers", "read_bytes", "second",
 ]  # fmt: skip
 
 MAX_FILE = 4 << 30  # bytes; a CAN log beyond this is split by every logger
-
-
-class LogError(InputError):
-    """A log cannot be used. One line: file, channel, reason."""
-
-    def __init__(self, text: str):
-        # names and cells of a damaged file end up in messages: keep them on one printable line
-        line = "".join(c if c.isprintable() else " " for c in text)
-        super().__init__(" ".join(line.split())[:1000])
 
 
 @dataclass(frozen=True)
@@ -73,6 +64,27 @@ class Source(Protocol):
     def has(self) -> str: ...
 
     def absent(self, name: str) -> str: ...
+
+
+class Samples:
+    """A source whose samples are at hand: name -> series. What had to be left out of the file is said in ``notes``."""
+
+    kind = "channel"
+    sorted = False
+
+    def __init__(self, series: Mapping[str, Series], notes: Iterable[str] = ()):
+        self.notes = list(notes)
+        self.names: dict[str, tuple[str, ...]] = {name: (name,) for name in series}
+        self._series = series
+
+    def has(self) -> str:
+        return names_held(self.kind, self.names)
+
+    def absent(self, name: str) -> str:
+        return ""
+
+    def series(self, key: str) -> Series:
+        return self._series[key]
 
 
 @dataclass(frozen=True)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from hil.logs.names import is_time
-from hil.logs.source import Channel, LogError, Options, Series, close_names, names_held
+from hil.logs.source import LogError, Options, Series, close_names, names_held
 from hil.logs.times import guess_column
 
-__all__ = ["NoTime", "Table", "Time", "arrow_table", "split_unit", "time_column"]
+__all__ = ["NoTime", "Table", "Time", "split_unit", "time_column"]
 
 _TIME_NAMES = ("t", "time", "timestamp", "timestamps", "time_s", "zeit")
 
@@ -121,30 +121,3 @@ def time_column(path: Path, headers: list[str], options: Options) -> Time:
         f"another){names_held('column', headers)}"
     )
     raise NoTime(text, headers)
-
-
-# --- writing ----------------------------------------------------------------------------------------------------------
-
-
-def _raster(channels: dict[str, Channel]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """All times of all channels, and each channel on them, NaN where it has no sample."""
-    t = np.unique(np.concatenate([c.t for c in channels.values()]))
-    columns = {}
-    for name, c in channels.items():
-        columns[name] = np.full(t.size, np.nan)
-        columns[name][np.searchsorted(t, c.t)] = c.values
-    return t, columns
-
-
-def arrow_table(channels: dict[str, Channel]) -> Any:
-    """Channels as a table of Arrow, t first, null where a channel has no sample."""
-    import pyarrow as pa
-
-    t, columns = _raster(channels)
-    arrays = [t, *columns.values()]
-    # from buffers: pa.array imports pandas, which takes a quarter of a second
-    known = [pa.py_buffer(np.packbits(~np.isnan(a), bitorder="little")) for a in arrays]
-    filled = [
-        pa.Array.from_buffers(pa.float64(), a.size, [k, pa.py_buffer(a)]) for k, a in zip(known, arrays, strict=True)
-    ]
-    return pa.Table.from_arrays(filled, names=["t", *columns])

@@ -9,11 +9,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from hil.logs.frames import Frames, write_through_can
+from hil.logs.frames import Frames
 from hil.logs.source import LogError, read_bytes
 from hil.logs.text_lines import join_parts, match_lines, part_of
 
-__all__ = ["read_trc", "write_trc"]
+__all__ = ["read_trc"]
 
 _TRC_COLUMNS = {
     b"1.0": "OILD",
@@ -61,8 +61,3 @@ def read_trc(path: Path) -> Frames:
             bus = int(m["bus"]) if "B" in columns else 1
             parts.append(part_of(lines, 10**6, len(m["id"]) > 4, bus, min(most, 64)))
     return join_parts(path, parts, "TRC", "1)  10.0  Rx  00A0  8  00 01 02 03 04 05 06 07", [])
-
-
-def write_trc(path: Path, frames: Frames) -> None:
-    """Write a PEAK trace, version 2.1."""
-    write_through_can(path, frames, "TRCWriter")

@@ -10,14 +10,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from hil.logs.formats import suffixes
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError, meant
 
 __all__ = ["DESCRIPTION", "SHELLS", "add_options", "command"]
 
 SHELLS = ("bash", "zsh", "fish")
-DESCRIPTION = """Print a script that completes the commands of vaneloop, their options, and the words that an option
-takes. Everything else completes as a file.
+DESCRIPTION = """Print a script that completes the commands of vaneloop, their options, the words that an option takes,
+and logs by their suffixes, those of installed packages too. Everything else completes as a file.
 
 examples:
   vaneloop completion bash
@@ -52,6 +53,7 @@ class _Taken:
 
     flags   of an option; empty for a place
     words   what it takes; ``only`` these, or files as well
+    logs    its files are logs
     value   whether it takes anything
     """
 
@@ -60,6 +62,7 @@ class _Taken:
     only: bool
     value: bool
     about: str
+    logs: bool = False
 
 
 def _known() -> dict[str, tuple[str, ...]]:
@@ -80,6 +83,7 @@ def _known() -> dict[str, tuple[str, ...]]:
     }  # fmt: skip
 
 
+_LOGS = ("log", "logs", "--log", "--also")
 _ALONE = ("--strategy", "--criterion", "--on", "--without", "shell")  # no file is one of these
 
 
@@ -96,7 +100,7 @@ def _commands() -> dict[str, list[_Taken]]:
             what = a.option_strings[-1] if a.option_strings else a.dest
             words = tuple(map(str, a.choices or ())) or known.get(f"{name} {what}", known.get(what, ()))
             only = bool(a.choices) or what in _ALONE
-            out.append(_Taken(tuple(a.option_strings), words, only, a.nargs != 0, _help(a)))
+            out.append(_Taken(tuple(a.option_strings), words, only, a.nargs != 0, _help(a), what in _LOGS))
             if isinstance(a, argparse._SubParsersAction):
                 for part, its in a.choices.items():
                     yield from taken(f"{name} {part}", its)
@@ -132,16 +136,21 @@ def _parts(commands: dict[str, list[_Taken]]) -> str:
 
 
 def _place(taken: list[_Taken]) -> tuple[tuple[str, ...], str]:
-    """Words that stand at a command's place beside files, and what a shell is told where no file does."""
-    place = next((a for a in taken if not a.flags and a.words), None)
-    return (place.words, " files=" if place.only else "") if place else ((), "")
+    """Words that stand at a command's place beside files, and what a shell is told where no file does, or a log."""
+    place = next((a for a in taken if not a.flags and (a.words or a.logs)), None)
+    return (place.words, " files=" if place.only else " files=logs" if place.logs else "") if place else ((), "")
+
+
+def _endings(between: str) -> str:
+    """The suffixes of logs without their points."""
+    return between.join(s.removeprefix(".") for s in suffixes())
 
 
 def _with_words(commands: dict[str, list[_Taken]]) -> Iterator[tuple[str, _Taken]]:
-    """Every option that has words, with a shell's pattern of its command and its names."""
+    """Every option that has words or takes a log, with a shell's pattern of its command and its names."""
     for name, taken in commands.items():
         for a in taken:
-            if a.words and a.flags:
+            if (a.words or a.logs) and a.flags:
                 yield "|".join(f'"{name} {f}"' for f in a.flags), a
 
 
@@ -154,10 +163,21 @@ def _bash() -> str:
         place = f' place="{" ".join(own)}"' if own else ""
         lines.append(f'        "{name}") words="{flags}"{place}{files} ;;')
     for at, a in _with_words(commands):
+        if a.logs:
+            words.append(f"        {at}) _vaneloop_logs; return ;;")
+            continue
         more = "" if a.only else ' $(compgen -f -- "$cur")'
         offered = f'$(compgen -W "{" ".join(a.words)}" -- "$cur")'
         words.append(f"        {at}) COMPREPLY=({offered}{more}); return ;;")
     return "\n".join([
+        "_vaneloop_logs() {",  # folders and logs; where there are none, any file
+        "    local file files",
+        '    mapfile -t files < <(compgen -f -- "$cur")',
+        '    for file in "${files[@]}"; do case "${file,,}" in',
+        f'        *.{_endings("|*.")}) COMPREPLY+=("$file") ;;',
+        '        *) if [ -d "$file" ]; then COMPREPLY+=("$file"); fi ;;', "    esac; done",
+        '    if [ "${#COMPREPLY[@]}" -eq 0 ]; then COMPREPLY=("${files[@]}"); fi',
+        "}",
         "_vaneloop() {",
         '    local cur="${COMP_WORDS[COMP_CWORD]}" prev="${COMP_WORDS[COMP_CWORD-1]}" name="${COMP_WORDS[1]}"',
         '    local words="" place="" files=yes',
@@ -170,6 +190,7 @@ def _bash() -> str:
         '    case "$name $prev" in', *words, "    esac",
         '    case "$name" in', *lines, "    esac",
         '    if [[ "$cur" == -* ]]; then COMPREPLY=($(compgen -W "$words" -- "$cur"))',
+        '    elif [ "$files" = logs ]; then _vaneloop_logs',
         '    else COMPREPLY=($(compgen -W "$place" -- "$cur") ${files:+$(compgen -f -- "$cur")}); fi',
         "}",
         "complete -o filenames -F _vaneloop vaneloop",
@@ -187,7 +208,11 @@ def _zsh() -> str:
         own, files = _place(taken)
         place = f" place=({shlex.join(own)})" if own else ""
         lines.append(f'        "{name}") options=({flags}){place}{files} ;;')
+    logs = f"_files -g '*.(#i)({_endings('|')})'"  # where there are none, any file
     for at, a in _with_words(commands):
+        if a.logs:
+            words.append(f"        {at}) {logs}; return ;;")
+            continue
         more = "" if a.only else " _files;"
         words.append(f"        {at}) compadd -- {shlex.join(a.words)};{more} return ;;")
     return "\n".join([
@@ -204,7 +229,7 @@ def _zsh() -> str:
         '    case "$name" in', *lines, "    esac",
         '    if [[ "$PREFIX" == -* ]]; then _describe option options; return; fi',
         "    compadd -a place",
-        '    if [[ -n "$files" ]]; then _files; fi',
+        f'    if [[ "$files" == logs ]]; then {logs}; elif [[ -n "$files" ]]; then _files; fi',
         "}",
         # a file of fpath is the function itself when it is first called
         'if [[ "$funcstack[1]" == _vaneloop ]]; then _vaneloop "$@"; else compdef _vaneloop vaneloop; fi',
@@ -219,19 +244,26 @@ def _fish() -> str:
     out = [
         "function __vaneloop_is", "    set -l words (commandline -opc)",
         '    string match -q -- "$argv *" "$words[2..-1] "', "end",
+        "function __vaneloop_logs",  # folders and logs; where there are none, any file
+        '    set -l files (complete -C "__fish_command_without_completions "(commandline -ct))',
+        f"    string match -ri '^.*(?:\\.(?:{_endings('|')})|/)$' -- $files; or string join \\n -- $files", "end",
         "complete -c vaneloop -n __fish_use_subcommand -l help",
         "complete -c vaneloop -n __fish_use_subcommand -l version",
     ]  # fmt: skip
     out += [f"complete -c vaneloop -f -n __fish_use_subcommand -a {n} -d {quoted(t)}" for n, t in _about().items()]
+    logs = quoted("(__vaneloop_logs)")
     for name, all_taken in commands.items():
         seen = f"__vaneloop_is {name}"
         for a in all_taken:
             long = " ".join(f"-l {f[2:]}" if f.startswith("--") else f"-s {f[1:]}" for f in a.flags)
             takes = (" -x" if a.only else " -r -F") + f" -a {quoted(' '.join(a.words))}" if a.words else " -r"
+            takes = f" -x -k -a {logs}" if a.logs else takes
             if long:
                 out.append(
                     f"complete -c vaneloop -n {quoted(seen)} {long}{takes if a.value else ''} -d {quoted(a.about)}"
                 )
+            elif a.logs:
+                out.append(f"complete -c vaneloop -f -k -n {quoted(seen)} -a {logs}")
             elif a.words:
                 first = f"{seen}; and test (count (commandline -opc)) -eq {1 + len(name.split())}" if a.only else seen
                 files = "-f" if a.only else "-F"

@@ -40,7 +40,7 @@ exit codes: 0 good (also after Ctrl-C), 1 the controller did not answer or stopp
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--bus", metavar="B", help=f"{station.BUS_HELP}; default: vcan0 if there is one, else local")
-    parser.add_argument("--profile", metavar="F", help="speed demand: a name, or a file (.toml, .csv)")
+    parser.add_argument("--profile", metavar="F", help="speed demand: a name, or a file (.toml, or a log)")
     parser.add_argument(
         "--log", metavar="F", help="speed demand, and measured speed if it has one, from any log (docs/logs.md)"
     )
@@ -115,7 +115,7 @@ def demand_of(args: argparse.Namespace, notes: list[str], default: str | None = 
         near = meant(name, [*ecu.BUILTIN, "engine-test"])
         raise InputError(
             f"--profile {name!r} is not known{near}; allowed: {', '.join(ecu.BUILTIN)}, engine-test, or a file "
-            "(.toml, .csv)"
+            "(.toml, or a log)"
         )
     return ecu.read_profile(path, tell, **reading)
 

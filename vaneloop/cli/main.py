@@ -117,8 +117,8 @@ def _main(argv: list[str]) -> int:
 
 
 class _CanWithoutMdf:
-    """python-can imports asammdf for a format that is read otherwise here (`hil.logs.mdf`): 0.8 of its 0.9 s. In the
-    process of a command it is told that there is none. Whoever else imports asammdf gets it.
+    """python-can imports asammdf for a format that is read in another process here (`hil.logs.mdf`): 0.8 of its 0.9 s.
+    In the process of a command it is told that there is none. Whoever else imports asammdf gets it.
     """
 
     def find_spec(self, name: str, path: object = None, target: object = None) -> None:
@@ -132,8 +132,7 @@ def run() -> None:
     terminal.is_command = True
     # the matrices here are tall and narrow: a second thread of linear algebra spins more than it computes
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    if not any(".mf4" in word.lower() for word in sys.argv):
-        sys.meta_path.insert(0, _CanWithoutMdf())
+    sys.meta_path.insert(0, _CanWithoutMdf())
     sys.exit(main(sys.argv[1:]))
 
 

@@ -12,12 +12,13 @@ from functools import wraps
 from pathlib import Path
 from typing import Any
 
+from hil.logs.formats import OURS, is_framed, listed
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.verbs.machine import TABLES, Machine, files_of
 
 __all__ = [
-    "CAN_SUFFIXES",
+    "A_LOG",
     "add_controller_options",
     "add_log_options",
     "add_machine_options",
@@ -40,6 +41,8 @@ __all__ = [
     "trusted",
     "warm_up_for",
 ]
+
+A_LOG = f"{listed(OURS)}, or the format of a package (docs/logs.md)"
 
 
 def add_machine_options(parser: Any) -> None:
@@ -115,7 +118,7 @@ def say_located(args: argparse.Namespace, located: Any, most: int = 4) -> None:
 
 def add_log_options(parser: argparse.ArgumentParser) -> None:
     """Options that say how to read a log: the same for every command that takes one."""
-    parser.add_argument("log", metavar="LOG", help="candump .log, .asc, .blf, .trc, .mf4, .csv or .parquet")
+    parser.add_argument("log", metavar="LOG", help=f"a log: {A_LOG}")
     add_reading_options(parser.add_argument_group("reading the log (docs/logs.md)"))
 
 
@@ -293,9 +296,6 @@ def log_options(args: argparse.Namespace, source: str | None = None) -> dict[str
     }
 
 
-CAN_SUFFIXES = (".log", ".asc", ".blf", ".trc", ".mf4")
-
-
 def read_log_of(args: argparse.Namespace, require: tuple[str, ...] = ("n_dem",)) -> Any:
     """Read the log that ``args`` name; tell before code is compiled for it."""
     from hil.logs import read_log
@@ -307,7 +307,7 @@ def read_log_of(args: argparse.Namespace, require: tuple[str, ...] = ("n_dem",))
 
 def warm_up_for(args: argparse.Namespace) -> None:
     """Compile what cuts signals out of frames, and say so, where the log holds frames."""
-    if str(args.log).lower().endswith(CAN_SUFFIXES):
+    if is_framed(Path(str(args.log))):
         from hil.logs.columns import warm_up
 
         warm_up(lambda text: terminal.say(args, text))

@@ -11,10 +11,9 @@ from vaneloop.cli import station
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Record every frame on a CAN bus, with its time of arrival: candump (.log), BLF (.blf), MDF4 (.mf4) or
-Parquet (.parquet, with the signals of vgv.dbc in columns). The file can be opened at any time while it grows, and after
-any end, kill -9 too, which costs at most the last second. A file of that name that is there already is kept under
-another name.
+DESCRIPTION = """Record every frame on a CAN bus, with its time of arrival, in the format that the file's suffix says;
+in Parquet with the signals of vgv.dbc in columns. The file can be opened at any time while it grows, and after any end,
+kill -9 too, which costs at most the last second. A file of that name that is there already is kept under another name.
 
 examples:
   vaneloop record run.mf4
@@ -25,7 +24,7 @@ exit codes: 0 good (also after Ctrl-C), 1 frames were lost or the file could not
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("out", metavar="FILE", help="file to record to; its suffix says the format")
+    parser.add_argument("out", metavar="FILE", help=f"file to record to: {station.A_RECORDING}")
     parser.add_argument("--bus", metavar="B", help=f"{station.BUS_HELP}; default: vcan0 if there is one, else local")
     parser.add_argument("--duration", metavar="S", type=float, help="seconds to record (default: until Ctrl-C)")
     terminal.add_output_options(parser)

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from hil.logs.formats import OURS, listed
 from hil.replay import STAGE, STATISTICS, ReplayResult
 from vaneloop.base import terminal
 from vaneloop.cli import options
@@ -48,9 +49,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "other figures",
     )
     terminal.add_output_options(parser, report=True)
-    parser.add_argument(
-        "--out", metavar="F", help="write the simulated run as a log (.csv, .parquet, .mf4, .log, .asc, .blf, .trc)"
-    )
+    parser.add_argument("--out", metavar="F", help=f"write the simulated run as a log ({listed(OURS)})")
 
 
 @options.guarded

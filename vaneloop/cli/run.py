@@ -43,9 +43,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="seconds to run (default: until Ctrl-C; in lockstep the profile's or the record's)",
     )
     parser.add_argument(
-        "--record",
-        metavar="F",
-        help="record the frames taken and sent, at their ticks: .log (candump), .blf, .mf4 or .parquet",
+        "--record", metavar="F", help=f"record the frames taken and sent, at their ticks: {station.A_RECORDING}"
     )
     parser.add_argument(
         "--limit-late-us", metavar="N", type=float, help="exit 1 if a tick began more than N us after its deadline"
@@ -373,7 +371,7 @@ def _repeat(args: argparse.Namespace) -> int:
     import numpy as np
 
     from hil.bus.frames import AUTH_NAMES, FRESHNESS, HEAD_MASK, NAMES, PAUSE, PREPARED
-    from hil.logs.recorder import read_record
+    from hil.logs.recordings import read_record
     from hil.loop.node import replay
     from vaneloop.base.errors import InputError
 

@@ -45,11 +45,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--schedules", metavar="F.toml", default="schedules.toml", help="target angles over speed (default: shipped)"
     )
-    group.add_argument(
-        "--log",
-        metavar="LOG",
-        help="measured stroke-angle loop: candump .log, .asc, .blf, .trc, .mf4, .csv or .parquet",
-    )
+    group.add_argument("--log", metavar="LOG", help=f"measured stroke-angle loop, a log: {options.A_LOG}")
     group = parser.add_argument_group("adjusting the stages but the VIGV")
     group.add_argument(
         "--step", metavar="MM", type=float, default=0.5, help="lengths change by multiples of it (default 0.5 mm)"

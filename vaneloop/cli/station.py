@@ -12,17 +12,20 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from hil.logs.formats import OURS, spoken
 from vaneloop.base import terminal
 
 __all__ = [
-    "ACCEPTED", "BUS_HELP", "BusWatch", "Live", "add_realtime_options", "add_secoc_option", "authentication_json",
-    "authentication_words", "authenticator", "bus_name", "check_realtime_options", "check_seconds", "joined",
-    "print_lateness", "realtime_json", "recording", "say_authentication", "undisturbed", "warm_nodes",
+    "ACCEPTED", "A_RECORDING", "BUS_HELP", "BusWatch", "Live", "add_realtime_options", "add_secoc_option",
+    "authentication_json", "authentication_words", "authenticator", "bus_name", "check_realtime_options",
+    "check_seconds", "joined", "print_lateness", "realtime_json", "recording", "say_authentication",
+    "undisturbed", "warm_nodes",
 ]  # fmt: skip
 
 # both nodes' acceptance filter: 0x0A0 to 0x0BF, so that a flood of other identifiers costs a tick nothing
 ACCEPTED = [{"can_id": 0x0A0, "can_mask": 0x7E0}]
 
+A_RECORDING = spoken(f for f in OURS if f.recorder)
 BUS_HELP = "vcan0, can0, ... (SocketCAN), or local[:NAME] (embedded bus between processes; needs no CAN in the kernel)"
 
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from hil.logs.formats import format_of, suffixes
 from vaneloop.base.cells import unmarked
 from vaneloop.base.errors import InputError
 
 __all__ = ["Source", "find", "moment", "text_table"]
 
-SUFFIXES = (".log", ".asc", ".blf", ".trc", ".mf4", ".csv", ".parquet")
 # 2026-03-14, 20260314, each with or without T12:30:05, T1230, _12-30-05
 _DATE = re.compile(
     r"(?<!\d)((?:19|20)\d\d)-?(0[1-9]|1[0-2])-?(0[1-9]|[12]\d|3[01])"
@@ -76,18 +76,19 @@ def find(places: Sequence[str], engines: str | None = None) -> list[Source]:
         fault = "" if shown == path else "its name is not UTF-8; rename it"
         out.append(Source(shown, said.get("engine", ""), moment(said.get("time", "")), fault))
     if not out:
-        raise InputError(f"{', '.join(places)}: holds no log; allowed: {', '.join(SUFFIXES)}")
+        raise InputError(f"{', '.join(places)}: holds no log; allowed: {', '.join(suffixes())}")
     return out
 
 
 def _files(places: Sequence[str]) -> Iterator[str]:
+    ends = suffixes()
     for place in places:
         p = Path(place)
         if p.is_dir():
             for folder, _, names in os.walk(p.absolute()):
                 for name in names:
                     f = os.path.join(folder, name)
-                    if name[0] != "." and f.lower().endswith(SUFFIXES) and (os.path.islink(f) or os.path.isfile(f)):
+                    if name[0] != "." and f.lower().endswith(ends) and (os.path.islink(f) or os.path.isfile(f)):
                         yield f
         elif _is_file(p):
             yield str(p.absolute())
@@ -104,18 +105,13 @@ def _is_file(path: Path) -> bool:
 
 
 def _metadata(path: str) -> dict[str, str]:
-    """What a Parquet file says of itself; nothing of others, and of a damaged one (it becomes a row with a reason)."""
-    if not path.lower().endswith(".parquet") or not _is_file(Path(path)):
+    """What a file says of itself; nothing where it cannot be asked (it becomes a row with a reason)."""
+    if not _is_file(Path(path)):
         return {}
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     try:
-        said = pq.read_metadata(path).metadata or {}
-    except (OSError, pa.ArrowException):
+        return format_of(Path(path)).said_by(Path(path))
+    except InputError:
         return {}
-    names = (b"engine", b"time")
-    return {n.decode(): said[n].decode("utf-8", "replace") for n in names if n in said}
 
 
 def text_table(file: str, option: str) -> tuple[list[str], list[dict[str, str]]]:

@@ -7,21 +7,21 @@ from pathlib import Path
 
 import numpy as np
 
-from vaneloop.identification.user_models.by_log import NO_HELP, ByLog
+from hil.logs.formats import suffixes
+from vaneloop.discrepancy.models.by_log import NO_HELP, ByLog
 from vaneloop.pages.figures import UNDER, Line, Panel, bars, loop, overlay
 from vaneloop.pages.page import Page
 
 __all__ = ["curves_by_log", "heads", "log_by_log", "short_names"]
 
+OTHER_SUFFIXES = (".json", ".mat", ".txt")  # of runs that a program of the user's own has read
 SHOWN = 6  # logs whose curves are drawn
 
 
 def short_names(names: Sequence[str], width: int = 28) -> dict[str, str]:
     """File names as they fit into tables and axes: their ends, without the suffix, where that keeps them apart."""
-    stems = {
-        n: Path(n).stem if Path(n).suffix.lower() in (".csv", ".json", ".mat", ".parquet", ".mf4", ".txt") else n
-        for n in names
-    }
+    ends = (*suffixes(), *OTHER_SUFFIXES)
+    stems = {n: Path(n).stem if Path(n).suffix.lower() in ends else n for n in names}
     cut = {n: s if len(s) <= width else "…" + s[1 - width :] for n, s in stems.items()}
     return next((d for d in (cut, stems) if len(set(d.values())) == len(names)), {n: n for n in names})
 

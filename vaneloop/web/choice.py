@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-__all__ = ["LOG_SUFFIXES", "OTHER_SUFFIXES", "Choice", "LogFile", "Overlay", "safe_name"]
+__all__ = ["OTHER_SUFFIXES", "Choice", "LogFile", "Overlay", "safe_name"]
 
-LOG_SUFFIXES = (".log", ".asc", ".blf", ".trc", ".mf4", ".csv", ".parquet")
 OTHER_SUFFIXES = (".dbc", ".toml")  # beside a log: its database, a model file
 
 

@@ -7,20 +7,21 @@ from typing import Any
 
 from nicegui import events, ui
 
+from hil.logs.formats import suffixes as log_suffixes
 from plant import load_geometry
 from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES
 from vaneloop.verbs.machine import files_of
 from vaneloop.web.charts import OVER, Chart
 from vaneloop.web.frame import Live, card, drop, list_of_moments, opened, table
-from vaneloop.web.session import LOG_SUFFIXES, OTHER_SUFFIXES, STOPPED, LogFile, Session, safe_name
+from vaneloop.web.session import OTHER_SUFFIXES, STOPPED, LogFile, Session, safe_name
 
 __all__ = ["ChosenLog", "receive", "suffixes"]
 
 
 def suffixes() -> str:
     """What an upload accepts."""
-    return ",".join((*LOG_SUFFIXES, *OTHER_SUFFIXES))
+    return ",".join((*log_suffixes(), *OTHER_SUFFIXES))
 
 
 async def receive(s: Session, e: events.UploadEventArguments, section: str) -> LogFile | None:
@@ -28,10 +29,10 @@ async def receive(s: Session, e: events.UploadEventArguments, section: str) -> L
     know.
     """
     name = safe_name(e.file.name)
-    if not name.lower().endswith((*LOG_SUFFIXES, *OTHER_SUFFIXES)):
+    if not name.lower().endswith((*log_suffixes(), *OTHER_SUFFIXES)):
         s.errors[section] = (
             f"{name}: suffix {name[name.rfind('.') :] if '.' in name else ''!r} is not a log's; allowed: "
-            f"{', '.join(LOG_SUFFIXES)}"
+            f"{', '.join(log_suffixes())}"
         )
         s.touch(section)
         return None
@@ -41,7 +42,7 @@ async def receive(s: Session, e: events.UploadEventArguments, section: str) -> L
     await e.file.save(path)
     path.chmod(0o600)
     file = LogFile(path, name, name)
-    if name.lower().endswith(LOG_SUFFIXES):
+    if name.lower().endswith(log_suffixes()):
         s.files.append(file)
     s.touch("files")
     return file
@@ -140,7 +141,7 @@ class ChosenLog:
     def _rejected(self) -> None:
         limit = f"{self.most / 2**20:.0f} MB"
         self.s.errors["log"] = (
-            f"this file cannot be taken: it is larger than {limit}, or no log ({', '.join(LOG_SUFFIXES)})"
+            f"this file cannot be taken: it is larger than {limit}, or no log ({', '.join(log_suffixes())})"
         )
         self.s.touch("log")
 

@@ -22,6 +22,7 @@ from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse
 from nicegui import Client, ui
 from nicegui import app as pages
 
+from hil.logs.formats import suffixes
 from vaneloop.base import terminal
 from vaneloop.web import fleet, missing, run, schedule
 from vaneloop.web.charts import Curves, view
@@ -29,7 +30,7 @@ from vaneloop.web.guard import Guard
 from vaneloop.web.jobs import Cancelled, Spare
 from vaneloop.web.lasting import Lasting
 from vaneloop.web.private import private_folder
-from vaneloop.web.session import LOG_SUFFIXES, LogFile, Session
+from vaneloop.web.session import LogFile, Session
 
 __all__ = ["serve"]
 
@@ -110,10 +111,11 @@ def logs_in(folder: Path) -> list[LogFile]:
     """Logs of the examples and of ``folder``, as the user would name them there."""
     examples = HERE.parent.parent / "examples"
     out = []
+    ends = suffixes()
     for place in dict.fromkeys([folder.resolve(), examples]):
         if place.is_dir():
             for f in sorted(place.iterdir())[:500]:
-                if f.suffix.lower() in LOG_SUFFIXES and f.is_file():
+                if f.suffix.lower() in ends and f.is_file():
                     out.append(
                         LogFile(f, f.name if place != examples else f"example: {f.name}", os.path.relpath(f, folder))
                     )

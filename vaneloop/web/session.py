@@ -16,13 +16,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from hil.logs.formats import is_framed
 from vaneloop.base.signals import UNITS
 from vaneloop.web import moments
 from vaneloop.web.charts import OVER, Curves, Mark, Over, of_log, of_stage
-from vaneloop.web.choice import LOG_SUFFIXES, OTHER_SUFFIXES, Choice, LogFile, Overlay, safe_name
+from vaneloop.web.choice import OTHER_SUFFIXES, Choice, LogFile, Overlay, safe_name
 from vaneloop.web.jobs import Cancelled, Job, Spare, Worker, WorkError
 
-__all__ = ["LOG_SUFFIXES", "OTHER_SUFFIXES", "STOPPED", "Choice", "LogFile", "Session", "safe_name"]
+__all__ = ["OTHER_SUFFIXES", "STOPPED", "Choice", "LogFile", "Session", "safe_name"]
 
 STOPPED = "stopped; nothing is kept of it, start it again when you like"  # in place of a complaint
 LEADERS = 4  # candidate effects whose fits are made ahead
@@ -169,7 +170,7 @@ class Session:
             mapping = re.search(rb"(?m)^\[(names|units)\]", file.path.read_bytes()) is not None
             setattr(self.choice, "bench" if mapping else "model", file)
         else:
-            dbc = self.choice.dbc if file.path.suffix.lower() in (".log", ".asc", ".blf", ".trc", ".mf4") else None
+            dbc = self.choice.dbc if is_framed(file.path) else None
             first = self.choice if self.choice.file is None else Choice()
             self.choice = Choice(file=file, dbc=dbc, model=first.model, bench=first.bench, tables=self.tables)
             self.offered, self.seen, self.draft, self.overlays = [], None, {}, []

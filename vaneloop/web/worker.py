@@ -22,6 +22,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NoReturn
 
+from hil.logs.formats import is_framed
 from vaneloop.base.extras import needs
 from vaneloop.cli import options
 from vaneloop.web.jobs import LOADING
@@ -134,7 +135,7 @@ def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
     from vaneloop.base.errors import InputError
     from vaneloop.base.signals import UNITS
 
-    if words[0].lower().endswith(options.CAN_SUFFIXES):
+    if is_framed(Path(words[0])):
         warm_up(lambda text: progress(None, text))
     args = parsed("diagnose", words)
     named = {f"fault_{f}": f for f in FAULTS}  # as vgv.dbc calls them

@@ -1,0 +1,95 @@
+"""The time of a table in words: dates and times of day, however its logger wrote them."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import compute as pc
+
+from hil.logs.source import ABSENT, numbers
+
+__all__ = ["from_dates"]
+
+# days as loggers write them, and the clock; a decimal comma has become a point, Z has become +00:00
+_Y, _M, _D, _SHORT = r"(?P<y>\d{4})", r"(?P<m>\d{1,2})", r"(?P<d>\d{1,2})", r"(?P<y>\d{2})"
+_AMBIGUOUS = (
+    f"{_D}/{_M}/{_Y}", f"{_M}/{_D}/{_Y}", f"{_D}/{_M}/{_SHORT}", f"{_M}/{_D}/{_SHORT}", f"{_SHORT}/{_M}/{_D}",
+)  # fmt: skip
+_DAYS = (
+    f"{_Y}-{_M}-{_D}", f"{_Y}/{_M}/{_D}", rf"{_D}\.{_M}\.{_Y}", rf"{_D}\.{_M}\.{_SHORT}", *_AMBIGUOUS,
+    r"(?P<y>\d{4})(?P<m>\d{2})(?P<d>\d{2})",
+)  # fmt: skip
+_CLOCK = r"(?P<H>\d{1,2}):(?P<M>\d{2})(?::(?P<S>\d{2})(?P<f>\.\d+)?)?"
+_ZONE = r"(?: *(?P<zh>[+-]\d{2}):?(?P<zm>\d{2}))?"
+_NO_ZONE = 100  # hours that two digits cannot say
+
+
+def from_dates(text: Any) -> tuple[np.ndarray, str] | None:
+    """Seconds of Arrow's strings of dates or times of day (null: no sample), counted from the first, and a note; None
+    where they are none.
+
+    A time of day that falls back by more than half a day has passed midnight. Day, month and short year that cannot be
+    told apart do not matter within one day; beyond it such dates are refused (None).
+    """
+    text = pc.replace_substring_regex(pc.utf8_trim_whitespace(text), r"(\d),(\d+)", r"\1.\2")
+    text = pc.replace_substring_regex(text, r"(?i)\s*Z$", "+00:00")
+    known = np.asarray([v is not None for v in text.to_pylist()], bool)
+    there = text.drop_null()
+    if not len(there) or not re.search(r"\d[:T]\d|\d [\d:]", str(there[0])):
+        return None
+    fits = [day for day in _DAYS if _parsed(there[:50], f"{day}(?: +|T){_CLOCK}{_ZONE}") is not None]
+    for day in fits:
+        us = _parsed(there, f"{day}(?: +|T){_CLOCK}{_ZONE}")
+        if us is None:
+            continue
+        several = sum(f in _AMBIGUOUS for f in fits) > 1
+        if several and day in _AMBIGUOUS and np.unique(us // 86_400_000_000).size > 1:
+            return None
+        return _since(us, known), f"time: dates; {there[0]} taken for the start of the log"
+    us = _parsed(there, _CLOCK)
+    if us is None:
+        return None
+    us += 86_400_000_000 * np.cumsum(np.diff(us, prepend=us[0]) < -43_200_000_000)
+    return _since(us, known), f"time: of day; {there[0]} taken for the start of the log"
+
+
+def _parsed(text: Any, form: str) -> np.ndarray | None:
+    """Microseconds (int64) of dates or times of day that are all of one form and exist; None of others."""
+    parts = pc.extract_regex(text, f"^{form}$")
+    if parts.null_count:
+        return None
+
+    def whole(name: str, absent: int = 0) -> np.ndarray:
+        if parts.type.get_field_index(name) < 0:
+            return np.full(len(text), absent)
+        cells = pc.struct_field(parts, name)
+        if name == "f":  # digits of whole microseconds
+            cells = pc.utf8_slice_codeunits(pc.utf8_rpad(cells, 7, "0"), 1, 7)
+        cells = pc.if_else(pc.equal(cells, ""), str(absent), cells)
+        return numbers(cells.cast(pa.float64())).astype(np.int64)
+
+    year, month, day = whole("y", 1970), whole("m", 1), whole("d", 1)
+    hour, minute, second = whole("H"), whole("M"), whole("S")
+    east = whole("zh", _NO_ZONE)
+    zoned = east != _NO_ZONE
+    year += np.where(year < 69, 2000, np.where(year < 100, 1900, 0))
+    begins = (12 * (year - 1970) + month - 1).astype("M8[M]")
+    date = begins.astype("M8[D]") + (day - 1)
+    wrong = (month < 1) | (month > 12) | (date.astype("M8[M]") != begins) | (hour > 23) | (minute > 59) | (second > 60)
+    if wrong.any() or zoned.any() != zoned.all():
+        return None
+    if zoned.any():  # the sign is that of hours and minutes
+        signs = np.where([str(z).startswith("-") for z in pc.struct_field(parts, "zh").to_pylist()], -1, 1)
+        hour, minute = hour - east, minute - signs * whole("zm")
+    seconds = ((date.astype(np.int64) * 24 + hour) * 60 + minute) * 60 + second
+    return seconds * 1_000_000 + whole("f")
+
+
+def _since(us: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Seconds since the first of whole microseconds, on the rows that are ``known``; `ABSENT` on the others."""
+    out = np.full(known.size, ABSENT)
+    out[known] = (us - us[0]) * 1e-6
+    return out
