@@ -11,10 +11,12 @@ import pint
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from hil.logs import Channel, Log, LogError, csv_format, offered, read_log, source, write_log
 from hil.logs import log as logs
-from hil.logs.dates import from_dates
+from hil.logs.dates import OddRow, from_dates
 from hil.logs.mapping import Bench, read_mapping, write_mapping
 from hil.logs.opening import open_log
 from hil.logs.source import ABSENT, check_file, close_names, is_absent, names_held, numbers, read_bytes
@@ -22,6 +24,7 @@ from hil.logs.survey import MOST_LISTED, Row, Survey, sparkline, survey
 from hil.logs.table import NoTime, split_unit
 from hil.logs.times import guess_column, guess_unit
 from hil.logs.units import USUAL_UNITS, Units, factor_of
+from tests.conftest import examples
 from vaneloop.base.signals import UNITS
 
 
@@ -258,8 +261,9 @@ def test_a_table_with_a_row_a_frame_holds_from_that_frame_on(tmp_path: Path) -> 
 
 
 def dates(*cells: str | None) -> Any:
+    """Seconds; the place of a cell that is none as those before it; None where they are none."""
     found = from_dates(pa.array(list(cells), pa.string()))
-    return None if found is None else found[0].tolist()
+    return found.row if isinstance(found, OddRow) else None if found is None else found[0].tolist()
 
 
 NINE = dt.datetime(2024, 3, 7, 9, 8, 7, 654321)
@@ -308,7 +312,7 @@ def test_days_months_leap_years_and_centuries_count_as_in_the_calendar() -> None
                   "2023-04-01 12:60", "2023-04-01 12:00:61", "2023-04-00 12:00", "2023-04-01", "12", "x"):  # fmt: skip
         assert dates(wrong) is None, wrong
     assert dates("2023-04-01 23:59:60") == [0.0] and dates(None) is None
-    assert dates("2023-04-01 12:00", "x") is None
+    assert dates("2023-04-01 12:00", None, "x", "y") == 2
 
 
 def test_zones_are_all_there_or_none_and_their_sign_is_that_of_hours_and_minutes() -> None:
@@ -316,7 +320,7 @@ def test_zones_are_all_there_or_none_and_their_sign_is_that_of_hours_and_minutes
         [0.0, 19_800.0, 21_600.0]
     )
     assert dates("2024-01-01 12:00:00-03:30", "2024-01-01 12:00:00+00:00") == pytest.approx([0.0, -12_600.0])
-    assert dates("2024-01-01 12:00:00", "2024-01-01 12:00:00Z") is None
+    assert dates("2024-01-01 12:00:00", "2024-01-01 12:00:00Z") == 1
 
 
 def test_a_time_of_day_that_falls_by_more_than_half_a_day_has_passed_midnight() -> None:
@@ -326,14 +330,54 @@ def test_a_time_of_day_that_falls_by_more_than_half_a_day_has_passed_midnight() 
     assert dates("23:00", "01:00", "23:00", "01:00")[-1] == pytest.approx(26 * 3600.0)
 
 
+@given(st.integers(0, 12_000), st.integers(1, 40), st.sampled_from([1, 5, 49, 50, 51, 1200]), st.booleans())
+@settings(max_examples=examples(40))
+def test_every_row_says_which_number_is_the_day(first: int, step: int, n: int, day_first: bool) -> None:
+    """Two forms that all rows have are refused beyond one day; a row that has one alone decides, wherever it stands."""
+    form = "%d/%m/%Y %H:%M" if day_first else "%m/%d/%Y %H:%M"
+    days = [dt.datetime(2001, 1 + k * step % 12, 1 + (first + k) % 12) for k in range(n)]  # of which none decides
+    days.append(dt.datetime(2001, 1, 1) + dt.timedelta(days=first, hours=step))
+    text = [d.strftime(form) for d in days]
+
+    def as_other(form: str) -> list[dt.datetime] | None:
+        try:
+            return [dt.datetime.strptime(cell, form) for cell in text]
+        except ValueError:
+            return None
+
+    read = [d for f in ("%d/%m/%Y %H:%M", "%m/%d/%Y %H:%M") if (d := as_other(f)) is not None]
+    alike = len(read) == 1 or len({d.date() for d in read[0]}) == 1
+    want = [(d - read[0][0]).total_seconds() for d in read[0]] if alike else None
+    assert dates(*text) == (pytest.approx(want) if alike else None)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+@pytest.mark.parametrize(("form", "odd"), [
+    ("%d/%m/%Y %H:%M:%S", "03/13/2026 00:00:00"), ("%Y-%m-%d %H:%M:%S", "2026-02-29 00:00:00"),
+    ("%H:%M:%S", "24:00:00"),
+    ("%d.%m.%Y %H:%M:%S", "stopped"), ("%Y-%m-%dT%H:%M:%SZ", "2026-03-14T00:00:00"),
+])  # fmt: skip
+def test_a_row_that_is_no_date_as_those_before_is_refused_by_its_number(
+    tmp_path: Path, suffix: str, form: str, odd: str
+) -> None:
+    stamps = [(dt.datetime(2026, 3, 14) + dt.timedelta(seconds=k)).strftime(form) for k in range(90)]
+    stamps[70] = odd
+    if suffix == ".csv":
+        csv(tmp_path, "time,n_dem\n" + "".join(f"{s},{60 + k % 7}\n" for k, s in enumerate(stamps)))
+    else:
+        pq.write_table(pa.table({"time": stamps, "n_dem": [60.0 + k % 7 for k in range(90)]}), tmp_path / "a.parquet")
+    row = 72 if suffix == ".csv" else 71
+    assert refused(tmp_path / f"a{suffix}") == f"LOG: column 'time', row {row}: {odd!r} is no time as {stamps[0]!r} is"
+
+
 def test_a_day_and_a_month_that_cannot_be_told_apart_do_not_matter_within_a_day() -> None:
     assert dates("03/04/2024 10:00", "03/04/2024 11:00") == [0.0, 3600.0]
     assert dates("03/04/2024 10:00", "04/04/2024 10:00") is None
     assert dates("13/04/2024 10:00", "14/04/2024 10:00") == [0.0, 86_400.0]
     assert dates("04/13/2024 10:00", "04/14/2024 10:00") == [0.0, 86_400.0]
-    # the first fifty rows tell them apart, or none do
-    assert dates(*["03/04/2024 10:00"] * 49, "13/04/2024 10:00")[-1] == pytest.approx(10 * 86_400.0)
-    assert dates(*["03/04/2024 10:00"] * 50, "13/04/2024 10:00") is None
+    # any row may tell them apart
+    for n in (1, 49, 50, 2000):
+        assert dates(*["03/04/2024 10:00"] * n, "13/04/2024 10:00")[-1] == pytest.approx(10 * 86_400.0)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pyarrow as pa
 from pyarrow import csv as arrow
 
 from hil.logs.arrow import arrow_table
-from hil.logs.dates import from_dates
+from hil.logs.dates import OddRow, from_dates
 from hil.logs.source import ABSENT, Channel, LogError, Options, Source, numbers, read_bytes, second
 from hil.logs.table import Table, split_unit, time_column
 from hil.logs.units import NO_UNIT, factor_of
@@ -208,9 +208,11 @@ class _Csv:
             except ValueError:
                 if header == self.time:
                     none = {"", *_NO_SAMPLE}
-                    if (
-                        dates := from_dates(pa.array([None if c in none else c for c in text], pa.string()))
-                    ) is not None:
+                    dates = from_dates(pa.array([None if c in none else c for c in text], pa.string()))
+                    if isinstance(dates, OddRow):
+                        where = f"column {header!r}, row {dates.row + self.first}"
+                        raise LogError(f"{self.path}: {where}: {dates.why}") from None
+                    if dates is not None:
                         self.notes.append(dates[1])
                         return dates[0]
                 raise LogError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -11,7 +11,7 @@ from pyarrow import compute as pc
 
 from hil.logs.source import ABSENT, numbers
 
-__all__ = ["from_dates"]
+__all__ = ["OddRow", "from_dates"]
 
 # days as loggers write them, and the clock; a decimal comma has become a point, Z has become +00:00
 _Y, _M, _D, _SHORT = r"(?P<y>\d{4})", r"(?P<m>\d{1,2})", r"(?P<d>\d{1,2})", r"(?P<y>\d{2})"
@@ -24,43 +24,60 @@ _DAYS = (
 )  # fmt: skip
 _CLOCK = r"(?P<H>\d{1,2}):(?P<M>\d{2})(?::(?P<S>\d{2})(?P<f>\.\d+)?)?"
 _ZONE = r"(?: *(?P<zh>[+-]\d{2}):?(?P<zm>\d{2}))?"
+_FEW = 1000  # rows that most forms of another kind are told by
 _NO_ZONE = 100  # hours that two digits cannot say
 
 
-def from_dates(text: Any) -> tuple[np.ndarray, str] | None:
-    """Seconds of Arrow's strings of dates or times of day (null: no sample), counted from the first, and a note; None
-    where they are none.
+class OddRow(NamedTuple):
+    """A cell that is no date as those before it are: its place in the column, from 0, and why."""
 
-    A time of day that falls back by more than half a day has passed midnight. Day, month and short year that cannot be
-    told apart do not matter within one day; beyond it such dates are refused (None).
+    row: int
+    why: str
+
+
+def from_dates(text: Any) -> tuple[np.ndarray, str] | OddRow | None:
+    """Seconds of Arrow's strings of dates or times of day (null: no sample), counted from the first, and a note; the
+    first cell that is none, where those before it are dates; None where they are none.
+
+    The form is one that all rows have. A time of day that falls back by more than half a day has passed midnight. Day,
+    month and short year that no row tells apart do not matter within one day; beyond it such dates are refused (None).
     """
-    text = pc.replace_substring_regex(pc.utf8_trim_whitespace(text), r"(\d),(\d+)", r"\1.\2")
-    text = pc.replace_substring_regex(text, r"(?i)\s*Z$", "+00:00")
     known = np.asarray([v is not None for v in text.to_pylist()], bool)
-    there = text.drop_null()
+    cells = text.drop_null()
+    there = pc.replace_substring_regex(pc.utf8_trim_whitespace(cells), r"(\d),(\d+)", r"\1.\2")
+    there = pc.replace_substring_regex(there, r"(?i)\s*Z$", "+00:00")
     if not len(there) or not re.search(r"\d[:T]\d|\d [\d:]", str(there[0])):
         return None
-    fits = [day for day in _DAYS if _parsed(there[:50], f"{day}(?: +|T){_CLOCK}{_ZONE}") is not None]
-    for day in fits:
-        us = _parsed(there, f"{day}(?: +|T){_CLOCK}{_ZONE}")
-        if us is None:
-            continue
-        several = sum(f in _AMBIGUOUS for f in fits) > 1
-        if several and day in _AMBIGUOUS and np.unique(us // 86_400_000_000).size > 1:
-            return None
-        return _since(us, known), f"time: dates; {there[0]} taken for the start of the log"
-    us = _parsed(there, _CLOCK)
-    if us is None:
+    read, furthest = {}, 0
+    for day in (*_DAYS, ""):
+        form = f"{day}(?: +|T){_CLOCK}{_ZONE}" if day else _CLOCK
+        us = _parsed(there[:_FEW], form)
+        us = us if isinstance(us, int) else _parsed(there, form)
+        if isinstance(us, int):
+            furthest = max(furthest, us)
+        else:
+            read[day] = us
+    if not read:
+        why = f"{str(cells[furthest])[:40]!r} is no time as {str(cells[0])[:40]!r} is"
+        return OddRow(int(np.flatnonzero(known)[furthest]), why) if furthest else None
+    day, us = next(iter(read.items()))
+    if not day:
+        us = us + 86_400_000_000 * np.cumsum(np.diff(us, prepend=us[0]) < -43_200_000_000)
+        return _since(us, known), f"time: of day; {there[0]} taken for the start of the log"
+    if sum(d in _AMBIGUOUS for d in read) > 1 and day in _AMBIGUOUS and np.unique(us // 86_400_000_000).size > 1:
         return None
-    us += 86_400_000_000 * np.cumsum(np.diff(us, prepend=us[0]) < -43_200_000_000)
-    return _since(us, known), f"time: of day; {there[0]} taken for the start of the log"
+    return _since(us, known), f"time: dates; {there[0]} taken for the start of the log"
 
 
-def _parsed(text: Any, form: str) -> np.ndarray | None:
-    """Microseconds (int64) of dates or times of day that are all of one form and exist; None of others."""
+def _parsed(text: Any, form: str) -> np.ndarray | int:
+    """Microseconds (int64) of dates or times of day that are all of one form and exist; of others the place of the
+    first that is not.
+    """
     parts = pc.extract_regex(text, f"^{form}$")
     if parts.null_count:
-        return None
+        first = int(pc.index(parts.is_null(), True).as_py())
+        before = _parsed(text[:first], form) if first else 0
+        return before if isinstance(before, int) else first
 
     def whole(name: str, absent: int = 0) -> np.ndarray:
         if parts.type.get_field_index(name) < 0:
@@ -79,8 +96,9 @@ def _parsed(text: Any, form: str) -> np.ndarray | None:
     begins = (12 * (year - 1970) + month - 1).astype("M8[M]")
     date = begins.astype("M8[D]") + (day - 1)
     wrong = (month < 1) | (month > 12) | (date.astype("M8[M]") != begins) | (hour > 23) | (minute > 59) | (second > 60)
-    if wrong.any() or zoned.any() != zoned.all():
-        return None
+    wrong |= zoned != zoned[0]
+    if wrong.any():
+        return int(np.argmax(wrong))
     if zoned.any():  # the sign is that of hours and minutes
         signs = np.where([str(z).startswith("-") for z in pc.struct_field(parts, "zh").to_pylist()], -1, 1)
         hour, minute = hour - east, minute - signs * whole("zm")
