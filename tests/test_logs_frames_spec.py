@@ -221,6 +221,8 @@ def test_what_is_no_blf_is_refused(tmp_path: Path) -> None:
         read(tmp_path)
     with pytest.raises(LogError, match="no CAN frame in it"):
         read(tmp_path, container(obj(TEXT, bytes(40))))
+    with pytest.raises(LogError, match="no CAN frame in it"):
+        read(tmp_path, container(obj(CAN, classic(1, b"", flags=0x80))))  # a remote frame has no data
 
 
 @pytest.mark.parametrize(

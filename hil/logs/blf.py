@@ -31,7 +31,7 @@ def read_blf(path: Path) -> Frames:
     objects, more = _blf_objects(stream)
     notes = [f"{damaged + more} damaged places in the BLF: what is there was left out"] if damaged + more else []
     parts = [part for kind in (_CAN, _CAN2, _FD, _FD64) for part in _blf_frames(stream, objects, kind)]
-    if not parts:
+    if not any(part[0].size for part in parts):  # remote frames may be all there are
         raise LogError(f"{path}: no CAN frame in it")
     order = np.argsort(np.concatenate([p[0] for p in parts]), kind="stable")
     _, ns, ident, bus, length = (np.concatenate([p[k] for p in parts])[order] for k in range(5))

@@ -211,8 +211,9 @@ def _loaded(path: str | Path, suffix: str, entry: metadata.EntryPoint) -> Format
         raise LogError(f"{whose}, which is {type(found).__name__}, not hil.logs.Format")
     if suffix not in found.suffixes:
         raise LogError(f"{whose}, whose suffixes are {listed([found]) or 'none'}")
-    parts = {name: part for name in _PARTS if (part := getattr(found, name)) is not None}
-    return replace(found, extra="", **{name: _guarded(part, name, whose) for name, part in parts.items()})
+    parts: dict[str, Any] = {name: part for name in _PARTS if (part := getattr(found, name)) is not None}
+    parts = {name: _guarded(part, name, whose) for name, part in parts.items()}
+    return replace(found, extra="", **parts)
 
 
 def _guarded(part: str | Callable[..., Any], name: str, whose: str) -> Callable[..., Any]:

@@ -307,7 +307,7 @@ def contradictions(channels: Mapping[str, _Samples], guessed: set[str], tables: 
 
 def _mean_stroke(tables: Files) -> tuple[np.ndarray, np.ndarray]:
     """The controller's mean curve: rotor speed (%), stroke (mm)."""
-    from controller import load_calibration
+    from controller import load_calibration  # late: with numba and scipy, which only a guess of these needs
 
     calibration, strokes, angles = (tables.get(n, f"{n}.toml") for n in ("calibration", "stroke_tables", "vane_angles"))
     table = load_calibration(calibration, strokes, angles=angles).table
@@ -328,7 +328,7 @@ def _off_schedule(stroke: np.ndarray, speed: np.ndarray, tables: Files) -> str:
 
 def _other_vane(vane: str, channels: Mapping[str, _Samples], tables: Files) -> str:
     """The stage whose schedule a vane follows instead of its own, by the rotor speed; "" where none is clear."""
-    from plant.geometry import load_schedules
+    from plant.geometry import load_schedules  # late: with numba and scipy, which only a guess of these needs
 
     schedules = load_schedules(tables.get("schedules", "schedules.toml"))
     speed = next((channels[s] for s in ("n_r", "n_dem") if s in channels), None)

@@ -38,7 +38,8 @@ class Groups(Samples):
     """Channel groups of an MDF4 file: `CHANNEL`, or `GROUP.CHANNEL` where several groups have it."""
 
     def __init__(self, content: dict[str, Any]):
-        super().__init__({key: Series(*held, framed=framed) for key, (*held, framed) in content["series"].items()})
+        held = content["series"].items()
+        super().__init__({key: Series(t, values, unit, framed=framed) for key, (t, values, unit, framed) in held})
         self.names = {key: tuple(names) for key, names in content["names"].items()}
         self.comments: dict[str, str] = content["comments"]
         self._why = content["why"]
