@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hil.logs.formats import suffixes
-from vaneloop.discrepancy.models.by_log import NO_HELP, ByLog
+from vaneloop.identification.user_models.by_log import NO_HELP, ByLog
 from vaneloop.pages.figures import UNDER, Line, Panel, bars, loop, overlay
 from vaneloop.pages.page import Page
 
