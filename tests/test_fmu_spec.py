@@ -334,6 +334,19 @@ def one(*lines: str, before: str = "") -> str:
         ("%x = frem double %d, %d", "frem"),
         ("%x = sdiv i1 %i, %i", "sdiv"),
         ("switch ptr %a, label %b []", "label"),
+        ("store i64 i8*, ptr %a", "store i64 i8*, ptr %a"),
+        ("store i1 true, ptr %a", "store i1 true, ptr %a"),
+        ("%x = load float, ptr %a", "load float"),
+        ("%x = fadd double %d, one", "fadd double %d, one"),
+        ("%x = fadd double %d", "fadd double %d"),
+        ("%x = add <2 x i64> %i, %i", "add <2 x i64> %i, %i"),
+        ("%x = phi <2 x i64> [ %i, %b ]", "phi <2 x i64>"),
+        ("%x = icmp slt i7 %i, %i", "icmp slt i7"),
+        ("%x = icmp eq i64", "icmp eq i64"),
+        ("%x = alloca float", "alloca float"),
+        ("%x = alloca i64, i64 %i", "alloca i64, i64 %i"),
+        ("br i1 true, label %b, label %c", "br i1 true"),
+        ("ret", "ret"),
     ],
 )
 def test_what_is_not_known_is_refused_with_its_line(line: str, says: str) -> None:
@@ -341,10 +354,19 @@ def test_what_is_not_known_is_refused_with_its_line(line: str, says: str) -> Non
         translate(one(line, "ret i32 0"), "f", "serve")
 
 
+def test_bytes_that_are_no_whole_numbers_are_refused() -> None:
+    text = one("store ptr @tab, ptr %a", "ret i32 0", before='@tab = constant [9 x i8] c"abcdefghi"\n')
+    with pytest.raises(NotImplementedError, match=r"\[9 x i8\]"):
+        translate(text, "f", "serve")
+
+
 def test_a_type_that_c_has_not_is_refused() -> None:
     for kind in ("float", "i65", "i64x", "<2 x double>", "i0"):
-        with pytest.raises(KeyError):
+        with pytest.raises(NotImplementedError, match="fadd"):
             translate(one(f"%x = fadd {kind.split()[0]} %d, %d", "ret i32 0"), "f", "serve")
+    for head in ("define float @f(ptr %a) {", "define i32 @f(float %a) {", "define i32 @f(ptr %a, <2 x i64> %i) {"):
+        with pytest.raises(NotImplementedError):
+            translate(f"{head}\n  ret i32 0\n}}\n", "f", "serve")
 
 
 def test_the_text_is_one_function_and_what_it_calls() -> None:
@@ -359,6 +381,8 @@ def test_the_text_is_one_function_and_what_it_calls() -> None:
     assert "static const uint64_t g__tab[] = {0x8807060504030201u, 0x5c67666564226261u};" in text
     assert "static const uint64_t g__zero[] = {0x0u};" in text
     assert "return 1;" in translate(one("unreachable"), "f", "serve")
+    for kind, n in (("ptr", 1), ("i32", 1), ("{ double, [3 x i64], i8 }", 5), ("[2 x { i64, ptr }]", 4)):
+        assert f"uint64_t v3_of[{n}];" in translate(one(f"%x = alloca {kind}, align 8", "ret i32 0"), "f", "serve")
     pickled = one("store ptr @.pickle, ptr %a", "ret i32 0", before='@.pickle = constant [8 x i8] c"abcdefgh"\n')
     assert "static const uint64_t g__pickle[1] = {0};" in translate(pickled, "f", "serve")
 

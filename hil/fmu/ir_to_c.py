@@ -10,6 +10,7 @@ The text is that of LLVM 20 (llvmlite 0.50): https://llvm.org/docs/LangRef.html
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 import struct
@@ -106,6 +107,15 @@ def translate(ir: str, entry: str, name: str) -> str:
     return "\n".join([HEAD, *constants, *heads, "", *texts])
 
 
+@contextlib.contextmanager
+def _known(line: str) -> Iterator[None]:
+    """Raise NotImplementedError with the line where a type, an operand or a constant in it is not as expected."""
+    try:
+        yield
+    except (LookupError, ValueError, struct.error) as e:
+        raise NotImplementedError(line) from e
+
+
 def _identifier(name: str) -> str:
     return "g_" + re.sub(r"\W", "_", name.strip('"'))
 
@@ -121,7 +131,8 @@ def _constant(ir: str, name: str) -> str:
     if found[3] is not None:
         text = re.sub(r"\\([0-9A-Fa-f]{2})", lambda m: chr(int(m[1], 16)), found[3].replace("\\\\", "\\5C"))
         data = text.encode("latin-1")
-    words = struct.unpack(f"<{len(data) // 8}Q", data)
+    with _known(found[0]):
+        words = struct.unpack(f"<{len(data) // 8}Q", data)
     return f"static const uint64_t {_identifier(name)}[] = {{{', '.join(f'{w:#x}u' for w in words)}}};"
 
 
@@ -154,7 +165,8 @@ class _Function:
         self.arguments = []
         for a in _split(found[3]):
             kind, value = a.split()[0], a.split()[-1]
-            self.arguments.append(f"{_C[kind]} {self._variable(value, kind, declare=False)}")
+            with _known(a):
+                self.arguments.append(f"{_C[kind]} {self._variable(value, kind, declare=False)}")
         self.blocks = self._blocks(found[4])
 
     def _blocks(self, body: str) -> dict[str, list[str]]:
@@ -217,14 +229,17 @@ class _Function:
                 lines.append(f"{self._label(label)}:;")
             phis = [line for line in block if re.search(r"= phi ", line)]
             for line in phis:
-                v = self._variable(line.split(" = ")[0], line.split(" = phi ")[1].split()[0])
+                with _known(line):
+                    v = self._variable(line.split(" = ")[0], line.split(" = phi ")[1].split()[0])
                 self.types[f"{v}_in"] = self.types[v]
                 lines.append(f"{v} = {v}_in;")
             for line in block:
                 if line not in phis:
-                    lines += self._lines(line, label)
+                    with _known(line):
+                        lines += self._lines(line, label)
         variables = [f"    {kind} {v};" for v, kind in self.types.items()]
-        head = f"{self.static}{_C[self.returned]} {self.name}({', '.join(self.arguments)}) {{"
+        with _known(f"define {self.returned}"):
+            head = f"{self.static}{_C[self.returned]} {self.name}({', '.join(self.arguments)}) {{"
         return "\n".join([head, *variables, *(f"    {x}" for x in lines), "}", ""])
 
     def _edge(self, here: str, there: str) -> Iterator[str]:
@@ -253,11 +268,12 @@ class _Function:
             yield "return 1;"
         elif op == "store":
             (kind, value), (_, place) = (a.split(" ", 1) for a in _split(args))
+            _at_address(kind, line)
             yield f"st_{kind}({self._value(place, 'ptr')}, {self._value(value, kind)});"
         elif op == "call":
             yield self._call(target, args)
         elif op == "alloca":
-            self.types[f"{self._variable(target, 'ptr')}_of[2]"] = "uint64_t"
+            self.types[f"{self._variable(target, 'ptr')}_of[{_words(args)}]"] = "uint64_t"
             v = self._variable(target)
             yield f"{v} = (uintptr_t){v}_of;"
         else:
@@ -334,6 +350,7 @@ class _Function:
             return "ptr", f"{self._value(base.split(' ', 1)[1], 'ptr')} + (uintptr_t){self._value(value, kind)}{size}"
         if op == "load":
             kind, place = _split(args)
+            _at_address(kind, line)
             return kind, f"ld_{kind}({self._value(place.split(' ', 1)[1], 'ptr')})"
         if op == "select":
             condition, a, b = _split(args)
@@ -360,10 +377,27 @@ class _Function:
         raise NotImplementedError(line)
 
 
+def _at_address(kind: str, line: str) -> None:
+    """Raise NotImplementedError where no value of this type is read or written at an address."""
+    if f" ld_{kind}(" not in HEAD:
+        raise NotImplementedError(line)
+
+
+def _words(kind: str) -> int:
+    """Places of 8 bytes that a type takes at most: each of its numbers has one."""
+    if m := re.fullmatch(r"\[(\d+) x (.+)\]", kind):
+        return int(m[1]) * _words(m[2])
+    if m := re.fullmatch(r"\{ (.+) \}", kind):
+        return sum(map(_words, _split(m[1])))
+    return -(-_SIZE[kind] // 8)
+
+
 def _compared(op: str, how: str, kind: str, a: str, b: str) -> str:
     if op == "icmp":
         if how in ("eq", "ne"):
             return f"{a} {'==' if how == 'eq' else '!='} {b}"
+        if kind != "ptr" and kind not in _UNSIGNED:
+            raise ValueError(f"{kind} has no order")
         c = (_UNSIGNED if how[0] == "u" else _C).get(kind, "uintptr_t")
         return f"({c}){a} {_ORDER[how[1:]]} ({c}){b}"
     if how in ("ord", "uno"):
