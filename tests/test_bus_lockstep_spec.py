@@ -488,6 +488,19 @@ def test_rows_go_in_and_out_without_time_moving() -> None:
     assert got.tolist() == [[1 << 32 | 3, 3], [1 << 32 | 1, 1], [-7, -7]]
 
 
+def test_rows_are_of_frames_that_pass_the_filters_however_few_fit() -> None:
+    channel = Channel(queue=8)
+    a = LockstepBus(channel)
+    b = LockstepBus(channel, can_filters=[{"can_id": 0xB0, "can_mask": 0x7F0, "extended": False}])
+    a.write_rows(np.array([[8 << 32 | ident, k] for k, ident in enumerate((0xA0, 0xB0, 0xA1, 0x1B0, 0xB3))], np.int64))
+    channel.advance(0.01)
+    rows = np.zeros((1, 2), np.int64)
+    got = []
+    while b.read_rows(rows):
+        got.append(rows[0].tolist())
+    assert got == [[8 << 32 | 0xB0, 1], [8 << 32 | 0xB3, 4]]
+
+
 def test_what_waits_to_be_sent_can_be_forgotten() -> None:
     a, b, c = two()
     for k in range(5):

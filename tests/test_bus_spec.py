@@ -1316,6 +1316,22 @@ def test_filters_hold_for_a_participant(desk: Desk) -> None:
     assert [m and m.arbitration_id for m in (bus.recv(0), bus.recv(0), bus.recv(0))] == [None, 0xB1, None]
 
 
+def test_rows_are_of_frames_that_pass_the_filters_and_an_error_frame_passes_all(desk: Desk) -> None:
+    bus, other = desk.open(can_filters=[{"can_id": 0xB0, "can_mask": 0x7F0, "extended": False}])
+    for ident in (0xA0, 0xB1, EXTENDED | 0xB2, ERROR | 4, 0x1B0, 0xB3):
+        other.send(raw_packet(ident, 0))
+    rows = np.zeros((4, 2), np.int64)
+    assert bus.read_rows(rows[:1]) == 1 and bus.read_rows(rows[1:]) == 2 and bus.read_rows(rows[3:]) == 0
+    assert rows[:3, 0].tolist() == [0xB1, ERROR | 4, 0xB3]
+    other.send(raw_packet(ERROR | 4, 0))
+    got = bus.recv(0)
+    assert got is not None and got.is_error_frame
+    other.send(raw_packet(0xA0, 0))
+    bus.set_filters(None)
+    rows[0] = -7
+    assert bus.read_rows(rows[:1]) == 1 and rows[0].tolist() == [0xA0, 0]
+
+
 def test_the_readers_own_loss_is_counted_and_logged(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
     bus, other = desk.open()
     with caplog.at_level(logging.WARNING):

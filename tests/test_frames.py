@@ -689,3 +689,34 @@ def test_a_receiver_that_stood_still_forgets_the_frame_that_showed_the_counter()
     assert s.next() == "sync"
     frames.stand_still(s.r)
     assert s.next() == "sync" and s.count("stale") == 1
+
+
+class Heard(can.BusABC):
+    """A bus of python-can's own whose frames are given."""
+
+    def __init__(self, can_filters: Any):
+        super().__init__("none", can_filters=can_filters)
+
+    def matches(self, head: int) -> bool:
+        return self._matches_filters(frames.to_message(head, 0))
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise NotImplementedError
+
+    def shutdown(self) -> None:
+        self._is_shutdown = True
+
+
+IDENT = st.sampled_from([0, 1, 0xA0, 0xB0, 0xB3, 0x1B0, 0x7FF, 0x800, 0x1FFFFFFF])
+FILTER = st.fixed_dictionaries(
+    {"can_id": IDENT, "can_mask": st.sampled_from([0, 1, 0x7F0, 0x7FF, 0x1FFFFFFF])},
+    optional={"extended": st.booleans()},
+)
+
+
+@given(st.none() | st.lists(FILTER, max_size=3), IDENT, st.sampled_from([0, frames.EXTENDED, frames.REMOTE]))
+def test_filters_let_through_what_python_can_s_do_and_every_error_frame(filters: Any, ident: int, flags: int) -> None:
+    bus, head = Heard(filters), 8 << 32 | ident | flags
+    assert frames.passes(bus.filters, head) is bus.matches(head)
+    assert frames.passes(bus.filters, head | frames.ERROR) is True
+    bus.shutdown()

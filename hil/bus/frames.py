@@ -33,7 +33,7 @@ __all__ = [
     "ANGLES", "AUTH", "AUTH_NAMES", "COUNTS", "ECU_DEMAND", "ERROR", "EXTENDED", "FD", "FRAMES", "FRESHNESS", "NAMES",
     "PAUSE", "PREPARED", "REMOTE", "SEEDS", "UNAUTHENTIC", "VGV_ANGLES", "VGV_ANGLES_2", "VGV_ANGLES_3", "VGV_HEALTH",
     "VGV_SERVO", "VGV_STATUS", "decode", "decode_auth", "encode_auth", "from_bytes", "from_message", "new_receiver",
-    "receive", "refused", "stand_still", "to_bytes", "to_message", "with_demand", "word0",
+    "passes", "receive", "refused", "stand_still", "to_bytes", "to_message", "with_demand", "word0",
 ]  # fmt: skip
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
@@ -407,6 +407,16 @@ def from_message(message: can.Message) -> tuple[int, int]:
     length = message.dlc if message.is_remote_frame else len(message.data)
     head = message.arbitration_id & IDENT_MASK | flags | min(length, 64) << 32 | (FD if message.is_fd else 0)
     return head, int.from_bytes(bytes(message.data[:8]).ljust(8, b"\0"), "little", signed=True)
+
+
+def passes(filters: Any, head: int) -> bool:
+    """Whether acceptance filters (python-can's ``can_filters``; None: there are none) let a frame with this word 0
+    through. An error frame passes all, as in SocketCAN.
+    """
+    if filters is None or head & ERROR:
+        return True
+    ident, extended = head & IDENT_MASK, bool(head & EXTENDED)
+    return any(not (ident ^ f["can_id"]) & f["can_mask"] and f.get("extended", extended) == extended for f in filters)
 
 
 def to_message(

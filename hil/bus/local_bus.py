@@ -45,7 +45,7 @@ class LocalBus(can.BusABC):
 
     channel               name: letters, digits, ``_.-``, at most 60
     receive_own_messages  hear one's own frames, too (``is_rx`` is False on them)
-    can_filters           as everywhere in python-can
+    can_filters           as everywhere in python-can; error frames pass all, as in SocketCAN
     priority              SCHED_FIFO priority of this participant, 0..99: the broker takes the highest, where it may
     lost                  frames that this reader was too slow for, in all
     restarts              how often the broker had to be started anew
@@ -171,7 +171,7 @@ class LocalBus(can.BusABC):
             data=None if remote else data[:length],
             is_rx=mark != broker.MINE,
         )
-        return message, False
+        return message, message.is_error_frame
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send a frame; waits up to ``timeout`` s (None: as long as it takes) for room, then raises
@@ -206,12 +206,14 @@ class LocalBus(can.BusABC):
                 self._rejoin()
 
     def read_rows(self, rows: np.ndarray) -> int:
-        """Take what is there into ``rows`` (int64[n, 2], `hil.bus.frames`) without waiting; return how many."""
+        """Take what is there and passes the filters into the first rows of ``rows`` (int64[n, 2], `hil.bus.frames`)
+        without waiting; return how many.
+        """
         n = 0
         while n < len(rows) and (packet := self.receive_packet()) is not None:
             rows[n] = np.frombuffer(packet, "<i8", 2, broker.FRAME_AT)
             rows[n, 0] &= frames.HEAD_MASK
-            n += 1
+            n += frames.passes(self.filters, int(rows[n, 0]))
         return n
 
     def write_rows(self, rows: np.ndarray) -> int:

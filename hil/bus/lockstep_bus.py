@@ -21,7 +21,7 @@ import numpy as np
 from can.broadcastmanager import CyclicSendTaskABC, ModifiableCyclicTaskABC, RestartableCyclicTaskABC
 
 from hil.bus import wire as w
-from hil.bus.frames import from_message, to_message
+from hil.bus.frames import from_message, passes, to_message
 from hil.bus.wire import BIT_RATE, BITS_PER_TICK, Wire, new_wire, put, run_wire, take
 from hil.loop.node import MOST_SENT, Ecu, EcuArrays, Node, NodeArrays, ecu_tick, node_tick
 from vaneloop.base.compiled import in_place
@@ -134,7 +134,7 @@ class LockstepBus(can.BusABC):
     """A participant of a simulated wire.
 
     channel  a name (one wire per name and process) or a `Channel` made with options of its own
-    receive_own_messages, can_filters  as everywhere in python-can
+    receive_own_messages, can_filters  as everywhere in python-can; error frames pass all filters, as in SocketCAN
     receive_errors  error frames (SocketCAN's classes: 0x088 destroyed frame, 0x004 error passive or receive overflow,
                     0x040 bus-off, 0x100 back again)
     silent  listen only
@@ -224,7 +224,7 @@ class LockstepBus(can.BusABC):
                 message = to_message(
                     head & ~w.OWN, data, at / BIT_RATE, self.name or "lockstep", is_rx=not head & w.OWN
                 )
-                if self._matches_filters(message):
+                if message.is_error_frame or self._matches_filters(message):
                     return message
             now = int(channel.wire.clock[w.NOW])
             if end is not None and now >= end:
@@ -234,10 +234,17 @@ class LockstepBus(can.BusABC):
             channel.advance_to(now + BIT_RATE if end is None else end, self.place)
 
     def read_rows(self, rows: np.ndarray) -> int:
-        """Take what has come up to now into ``rows`` (int64[n, 2]); return how many. Time does not move."""
+        """Take what has come up to now and passes the filters into the first rows of ``rows`` (int64[n, 2]); return how
+        many. Time does not move.
+        """
         self._check()
-        n = take(self.channel.wire, self.place, rows)
-        rows[:n, 0] &= ~w.OWN
+        n = 0
+        while taken := take(self.channel.wire, self.place, rows[n:]):
+            new = rows[n : n + taken]
+            new[:, 0] &= ~w.OWN
+            passed = new[[passes(self.filters, head) for head in new[:, 0].tolist()]]
+            rows[n : n + len(passed)] = passed
+            n += len(passed)
         return n
 
     def write_rows(self, rows: np.ndarray) -> int:
