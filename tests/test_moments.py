@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import asyncio
-import queue
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from controller import FAULTS, MODES
+from hil.bus import port
 from hil.inject.scenario import library, load_scenario
+from hil.loop import realtime
 from vaneloop.web import loop, moments
 from vaneloop.web.charts import Mark
-from vaneloop.web.jobs import Cancelled, WorkError
+from vaneloop.web.jobs import Cancelled, Worker, WorkError
 from vaneloop.web.loop import COLUMNS
 from vaneloop.web.running import ANY, MOST, Loop
 from vaneloop.web.session import LogFile, Session
+from vaneloop.web.worker import Inbox
 
 STALE = 1 << FAULTS.index("demand_stale")
 
@@ -62,7 +66,7 @@ def test_a_log_s_moments_are_its_modes_its_faults_and_what_was_injected() -> Non
 @pytest.fixture
 def inbox(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing that another test told a loop of this process, and that ended before it heard, is heard by this one."""
-    monkeypatch.setattr(loop, "INBOX", queue.Queue())
+    monkeypatch.setattr(loop, "INBOX", Inbox())
 
 
 def test_what_is_injected_in_lockstep_is_marked_at_the_tick_at_which_it_begins(inbox: None) -> None:
@@ -72,9 +76,9 @@ def test_what_is_injected_in_lockstep_is_marked_at_the_tick_at_which_it_begins(i
         if isinstance(content, dict) and "rows" in content:
             told.append(content)
             if len(told) == 1:
-                loop.INBOX.put({"inject": "demand_stops"})
+                loop.INBOX.put(0, {"inject": "demand_stops"})
             if any(c["injected"] for c in told) and told[-1]["rows"][-1, 0] > began() + 1.0:
-                loop.INBOX.put({"stop": True})
+                loop.INBOX.put(0, {"stop": True})
 
     def began() -> float:
         ((t, name),) = [x for c in told for x in c["injected"]]
@@ -86,6 +90,51 @@ def test_what_is_injected_in_lockstep_is_marked_at_the_tick_at_which_it_begins(i
     faults = np.nan_to_num(rows[:, COLUMNS.index("faults")]).astype(int)
     stale = float(rows[np.flatnonzero(faults & STALE)[0], 0])
     assert 0.04 < stale - began() < 0.08  # five frames are missed first
+
+
+def test_what_is_told_too_late_is_not_heard_by_the_next_run(inbox: None) -> None:
+    news = {1: 0, 2: 0}
+
+    def run(task: int, ends_at: int) -> None:
+        def progress(share: float | None, content: Any) -> None:
+            if isinstance(content, dict) and "rows" in content:
+                news[task] += 1
+                if news[task] == ends_at:
+                    loop.INBOX.put(task, {"stop": True})
+
+        loop.INBOX.begin(task)
+        loop.lockstep(progress, 70.0, 0.0, None, 1, None)
+
+    run(1, 1)
+    loop.INBOX.put(1, {"stop": True})
+    loop.INBOX.put(1, {"demand": 90.0})
+    run(2, 3)
+    assert news[2] >= 3
+    assert loop.INBOX.take() is None
+
+
+def test_the_server_tells_the_task_that_runs_and_none_where_none_does() -> None:
+    sent: list[Any] = []
+    w = Worker()
+    w._connection = SimpleNamespace(send=sent.append)  # type: ignore[assignment]
+    w.tell(stop=True)
+    w.jobs = dict.fromkeys((7, 8))  # type: ignore[assignment]
+    w.tell(stop=True)
+    assert sent == [(7, "tell", {"stop": True})]
+
+
+def test_a_run_in_real_time_that_fails_hears_nothing_any_more(inbox: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: Any, **__: Any) -> None:
+        raise OSError("the bus is gone")
+
+    monkeypatch.setattr(port, "open_bus", lambda *_, **__: SimpleNamespace(read_rows=None, shutdown=lambda: None))
+    monkeypatch.setattr(realtime, "run_realtime", fails)
+    before = set(threading.enumerate())
+    with pytest.raises(OSError, match="gone"):
+        loop._in_real_time(lambda *_: None, "local", SimpleNamespace(tick=lambda *_: None), None, None)
+    assert set(threading.enumerate()) == before
+    loop.INBOX.put(0, {"stop": True})
+    assert loop.INBOX.take() == {"stop": True}
 
 
 def test_what_an_outsider_does_is_marked_when_its_first_action_begins(monkeypatch: pytest.MonkeyPatch) -> None:

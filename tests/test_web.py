@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import json
 import os
-import queue
 import re
 import signal
 import subprocess
@@ -1628,14 +1627,15 @@ def test_the_workbench_of_another_machine_says_so_in_its_commands(tmp_path: Path
 def test_the_live_loop_runs_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from vaneloop.base.vanes import VANES
     from vaneloop.web import loop
+    from vaneloop.web.worker import Inbox
 
-    monkeypatch.setattr(loop, "INBOX", queue.Queue())  # what the loop ends before it hears reaches no other test
+    monkeypatch.setattr(loop, "INBOX", Inbox())  # what the loop ends before it hears reaches no other test
     told: list[dict[str, Any]] = []
 
     def progress(share: float | None, content: Any) -> None:
         if isinstance(content, dict) and "rows" in content:
             told.append(content)
-            loop.INBOX.put({"stop": True})
+            loop.INBOX.put(0, {"stop": True})
 
     folder = str(ROOT / "examples" / "four_stages")
     loop.lockstep(progress, 70.0, 0.0, None, 1, None, folder)

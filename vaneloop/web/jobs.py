@@ -147,9 +147,9 @@ class Worker:
 
     def tell(self, **content: Any) -> None:
         """Say something to the task that is running; it is short and never waits long."""
-        if self._connection is not None:
+        if self._connection is not None and self.jobs:
             with contextlib.suppress(OSError):
-                self._connection.send((0, "tell", content))
+                self._connection.send((min(self.jobs), "tell", content))
 
     def stop(self) -> None:
         """End the process and everything that it started; whoever waits for an answer gets Cancelled."""

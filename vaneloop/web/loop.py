@@ -9,7 +9,6 @@ station hears on the bus.
 from __future__ import annotations
 
 import os
-import queue
 import random
 import sys
 import time
@@ -128,15 +127,12 @@ def _told() -> dict[str, Any]:
     tool's commands all.
     """
     out: dict[str, Any] = {}
-    while True:
-        try:
-            news = INBOX.get_nowait()
-        except queue.Empty:
-            return out
+    while (news := INBOX.take()) is not None:
         for every in ("inject", "xcp"):
             if every in news:
                 out.setdefault(every, []).append(news.pop(every))
         out |= news
+    return out
 
 
 class _Injected:
@@ -402,7 +398,8 @@ def _in_real_time(progress: Progress, name: str, station: Any, record: str | Non
 
     bus = open_bus(name, can_filters=accepted(parsed("run", [] if typed else ["--xcp"])))
     recorder = RecorderProcess(record, name.replace(":", "-")) if record else None
-    threading.Thread(target=follow, daemon=True).start()
+    following = threading.Thread(target=follow, daemon=True)
+    following.start()
 
     def live(report: Any) -> None:
         figures = {**report.begin.figures(), "ticks": report.ticks, "missed": report.missed, "skipped": report.skipped}
@@ -414,6 +411,8 @@ def _in_real_time(progress: Progress, name: str, station: Any, record: str | Non
                 station, Port(bus), stop=stop, put=recorder.put if recorder is not None else None, live=live
             )
     finally:
+        stop.asked = stop.asked or "ended"
+        following.join()  # what is told from now on is the next task's
         bus.shutdown()
         if recorder is not None:
             recorder.close()

@@ -467,7 +467,33 @@ def _limit_memory() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-INBOX: queue.Queue[dict[str, Any]] = queue.Queue()  # what the server tells a task that is running
+class Inbox:
+    """What the server tells the task that is running. What comes too late for one that has ended reaches no other."""
+
+    def __init__(self) -> None:
+        self._told: queue.Queue[tuple[int, dict[str, Any]]] = queue.Queue()
+        self._task = 0
+
+    def begin(self, task: int) -> None:
+        """A task begins to run: the number of its question."""
+        self._task = task
+
+    def put(self, task: int, content: dict[str, Any]) -> None:
+        """Tell a task something."""
+        self._told.put((task, content))
+
+    def take(self) -> dict[str, Any] | None:
+        """The next thing that the running task was told, or None."""
+        while True:
+            try:
+                task, content = self._told.get_nowait()
+            except queue.Empty:
+                return None
+            if task == self._task:
+                return content
+
+
+INBOX = Inbox()
 
 
 def main(fd: int, tasks: dict[str, Callable[..., Any]], load: Callable[[Progress], None] | None = None) -> NoReturn:
@@ -481,7 +507,7 @@ def main(fd: int, tasks: dict[str, Callable[..., Any]], load: Callable[[Progress
             while True:
                 number, name, arguments = connection.recv()
                 if name == "tell":
-                    INBOX.put(arguments)
+                    INBOX.put(number, arguments)
                 else:
                     questions.put((number, name, arguments))
         except (EOFError, OSError):
@@ -495,6 +521,7 @@ def main(fd: int, tasks: dict[str, Callable[..., Any]], load: Callable[[Progress
         connection.send(("progress", LOADING, (None, "")))
     while True:
         number, name, arguments = questions.get()
+        INBOX.begin(number)
         last = 0.0
 
         def progress(fraction: float | None, text: Any, number: int = number) -> None:
