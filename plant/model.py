@@ -53,7 +53,7 @@ from vaneloop.base.hysteresis import stops_of
 from vaneloop.base.tables import Bound, Finite, Table, read
 from vaneloop.base.vanes import MOST, VANES, vane_in
 
-__all__ = ["Learned", "Model", "allowed_of", "load_model", "write_model"]
+__all__ = ["Learned", "Model", "allowed_of", "load_model", "text_of", "write_model"]
 
 FAR = 4.0  # tolerances: a nominal parameter farther off is not recalibrated, something else is wrong
 
@@ -354,6 +354,11 @@ def load_model(path: str | Path, plant: Plant | None = None) -> Model:
 
 def write_model(path: str | Path, model: Model) -> None:
     """Write a model file that `load_model` reads as the same model. Raises InputError where it cannot be written."""
+    write(path, text_of(model))
+
+
+def text_of(model: Model) -> str:
+    """Content of the model file."""
     lines = []
     if model.meta:
         lines += ["[meta]", *(f"{_key(k)} = {json.dumps(v, ensure_ascii=False)}" for k, v in model.meta.items()), ""]
@@ -371,7 +376,7 @@ def write_model(path: str | Path, model: Model) -> None:
         for key, axis in ((_key(name), of), (f"{_key(name)}.second", of.pop("second", {}))):
             rows = [f"{k} = {json.dumps(v, ensure_ascii=False)}" for k, v in axis.items()]
             lines += [f"[curves.{key}]", *rows, ""] if rows else []
-    write(path, "\n".join(lines))
+    return "\n".join(lines)
 
 
 def _key(name: str) -> str:

@@ -773,6 +773,34 @@ def test_a_worst_machine_that_runs_otherwise_from_its_saved_files_is_not_the_sam
     assert not campaign._save(run, files, plan_of(), g, quantities, worst)[2]
 
 
+def test_a_worst_machine_that_cannot_be_saved_whole_leaves_the_earlier_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, quantities, run = begun(tmp_path, monkeypatch, "samples = 8")
+    (tmp_path / "T").mkdir()
+    (tmp_path / "T" / "plant.toml").write_text("tables")
+    g = Group("still", "soft", "mine")
+    files = {"scenario.still": str(tmp_path / "still.toml"), "tables.soft": str(tmp_path / "T")}
+    worst = {"point": [0.5, 0.5], "state_hash": "h", "margins": [1]}
+    monkeypatch.setattr(campaign, "trial_once", lambda *of: worst)
+    at = campaign._save(run, files, plan_of(), g, quantities, worst)[0]
+
+    def there() -> dict[str, bytes]:
+        return {str(f.relative_to(at)): f.read_bytes() for f in at.rglob("*") if f.is_file()}
+
+    before = there()
+    assert set(before) == {"command.txt", "model.toml", "still.toml", "tables/plant.toml"}
+    (at / "command.txt").unlink()
+    (at / "command.txt").mkdir()
+    with pytest.raises(InputError, match=r"command\.txt"):
+        campaign._save(run, files, plan_of(), g, quantities, worst | {"point": [0.9, 0.1]})
+    del before["command.txt"]
+    assert there() == before
+    (at / "command.txt").rmdir()
+    campaign._save(run, files, plan_of(), g, quantities, worst | {"point": [0.9, 0.1]})
+    assert there()["model.toml"] != before["model.toml"] and set(there()) == {*before, "command.txt"}
+
+
 def test_the_worst_machine_is_saved_with_all_that_it_is_made_of(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

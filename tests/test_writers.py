@@ -62,8 +62,6 @@ REASONS = {
     ("vaneloop/base/terminal.py", "NamedTemporaryFile"): "the traceback of a defect, always a new file",
     ("vaneloop/base/terminal.py", "open"): PIPE,
     ("vaneloop/base/terminal.py", "BufferedWriter"): PIPE,
-    ("vaneloop/fleet/campaign.py", "copyfile"): BESIDE,
-    ("vaneloop/fleet/campaign.py", "write_text"): BESIDE,
     ("vaneloop/fleet/folder.py", "rename"): BESIDE,
     ("vaneloop/fleet/journal.py", "open"): "a journal, appended to line by line",
     ("vaneloop/fleet/leases.py", "open"): "a sign of life: harmless where it is cut",

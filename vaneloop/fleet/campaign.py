@@ -11,15 +11,16 @@ from __future__ import annotations
 import fnmatch
 import json
 import shlex
-import shutil
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from plant import write_model
+from plant.model import text_of
 from vaneloop.base.errors import InputError
+from vaneloop.base.files import write_all
 from vaneloop.fleet import plan as plans
 from vaneloop.fleet.files import digest_of, read_json, whole_json
 from vaneloop.fleet.folder import Folder, copies_of
@@ -180,27 +181,40 @@ def _requirements(done: list[dict[str, Any]], search: dict[str, Any] | None) -> 
 def _save(
     folder: Folder, files: dict[str, str], plan: Plan, g: Group, quantities: list[Varied], worst: dict[str, Any]
 ) -> tuple[Path, str, bool]:
-    """Save the worst case with the command that runs it again; True: from these files it is the same, bit for bit."""
-    shutil.rmtree(folder.room("worst", g.name))
+    """Save the worst case with the command that runs it again, all its files or none; True: from these files it is the
+    same, bit for bit.
+    """
     at = folder.room("worst", g.name)
-    scenario = at / f"{g.scenario}.toml"
-    shutil.copyfile(files[f"scenario.{g.scenario}"], scenario)
+    scenario, model = at / f"{g.scenario}.toml", at / "model.toml"
     made = model_at(files, g, quantities, worst["point"])
-    write_model(at / "model.toml", made.noted(f"campaign {folder.path.name}, worst case of {g.name}"))
-    own = {f"scenario.{g.scenario}": str(scenario), "model": str(at / "model.toml")}
-    words = ["vaneloop", "inject", str(scenario), "--model", str(at / "model.toml")]
+    contents: dict[Path, str | bytes] = {
+        scenario: Path(files[f"scenario.{g.scenario}"]).read_bytes(),
+        model: text_of(made.noted(f"campaign {folder.path.name}, worst case of {g.name}")),
+    }
+    own = {f"scenario.{g.scenario}": str(scenario), "model": str(model)}
+    words = ["vaneloop", "inject", str(scenario), "--model", str(model)]
     for option, key in (
         ("tables", f"tables.{g.calibration}"),
         ("plant", "plant"),
         ("controller", f"firmware.{g.firmware}"),
     ):
         if key in files:
-            copy = at / f"{option}{Path(files[key]).suffix}"
-            (shutil.copytree if Path(files[key]).is_dir() else shutil.copyfile)(files[key], copy)
+            of, copy = Path(files[key]), at / f"{option}{Path(files[key]).suffix}"
+            for file in sorted(f for f in of.rglob("*") if f.is_file()) if of.is_dir() else [of]:
+                place = copy / file.relative_to(of)
+                folder.room("worst", g.name, *place.relative_to(at).parent.parts)
+                contents[place] = file.read_bytes()
             own[key] = str(copy)
             words += [f"--{option}", str(copy)]
+    contents[at / "command.txt"] = f"{shlex.join(words)}\n"
+    write_all(contents)
+    for old in sorted(at.rglob("*"), reverse=True):  # of an earlier save
+        if old.is_dir() and not old.is_symlink():
+            with suppress(OSError):  # it holds something
+                old.rmdir()
+        elif old not in contents:
+            old.unlink()
     again = trial_once(own, g, [], [])
-    (at / "command.txt").write_text(f"{shlex.join(words)}\n", encoding="utf-8")
     same = (again["state_hash"], again["margins"]) == (worst["state_hash"], worst["margins"])
     return at, shlex.join(words), same
 
