@@ -130,8 +130,8 @@ NAMES: dict[str, str] = {
 # pages whose steps, together, take a processor longer than 5 s
 DEAR = [
     "README.md",
-    *(f"docs/{name}.md" for name in ("bus", "engine_test", "fmu", "machines", "own_controller", "python", "rig")),
-    "docs/your_own_model.md",
+    *(f"docs/{name}.md" for name in ("bus", "engine_test", "fmu", "injection", "machines", "own_controller")),
+    *(f"docs/{name}.md" for name in ("python", "real_time", "rig", "your_own_model")),
 ]
 # the beginning of a step that takes long -> the quick test that covers what it does
 LONG: dict[str, str] = {

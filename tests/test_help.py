@@ -121,9 +121,8 @@ SMALLER = {"--frames 10000000": "--frames 20000", "--logs 40": "--logs 1 --durat
            "--logs 60": "--logs 1 --duration 60",
            "--out out/motor.parquet": "--out out/motor.parquet --logs 1 --duration 60"}  # fmt: skip
 # commands whose examples take long
-LONG = {"strategies", "design", "spatial", "clearance", "experiment", "diagnose", "engine-test",
-        "benchmarks.hidden_effect"}  # fmt: skip
-LONG_EXAMPLES = {"inject --all", "schedule --geometry", "engine-test --tables"}
+LONG = {"strategies", "design", "spatial", "clearance", "experiment", "diagnose", "hidden-effect", "engine-test"}
+LONG_EXAMPLES = {"inject --all", "schedule --geometry", "engine-test --tables", "export-fmu --part controller"}
 
 
 def runs(long: bool) -> list[tuple[str, str]]:

@@ -162,6 +162,7 @@ def both(reference: str, ticks: int, seed: int) -> None:
     assert modes >= {0.0, 1.0, 2.0, 3.0, 4.0}
 
 
+@pytest.mark.slow
 def test_wild_inputs_give_the_same_bits_as_the_firmware(reference: str) -> None:
     for seed in range(4):
         both(reference, 100_000, seed)

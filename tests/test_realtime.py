@@ -721,7 +721,7 @@ def test_a_lost_demand_frame_changes_the_run(recorded: Path, tmp_path: Path) -> 
     assert code == 1 and "differs: frame" in out
 
 
-@pytest.mark.parametrize("suffix", [".log", ".blf", ".mf4", ".parquet"])
+@pytest.mark.parametrize("suffix", [".log", ".blf", pytest.param(".mf4", marks=pytest.mark.slow), ".parquet"])
 def test_a_lockstep_run_is_recorded_and_repeats(suffix: str, tmp_path: Path) -> None:
     file = tmp_path / f"run{suffix}"
     args = ["run", "--bus", "lockstep", "--profile", "slam", "--duration", "4.001", "--seed", "2"]

@@ -98,6 +98,7 @@ def test_exceeded_tolerance_exits_1_and_says_which(own_log) -> None:
     assert vaneloop("compare", own_log / "biased.csv", "--tolerance", "vigv=0.6", "--quiet").returncode == 0
 
 
+@pytest.mark.slow
 def test_module_and_command_are_the_same(own_log) -> None:
     a = vaneloop(own_log / "own.csv", "--json", "-", "--quiet", module="hil.replay")
     b = vaneloop("replay", own_log / "own.csv", "--json", "-", "--quiet")

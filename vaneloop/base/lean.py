@@ -10,7 +10,8 @@ from typing import Any
 
 import llvmlite.binding as llvm
 import numba
-from numba.core import codegen, compiler, errors, event, sigutils, types
+from numba.core import codegen, compiler, errors, event, ir, sigutils, types
+from numba.core.annotations import type_annotations
 from numba.core.compiler_lock import global_compiler_lock
 
 __all__ = ["KNOWN", "called_by_code", "is_known"]
@@ -146,6 +147,39 @@ def _plain(self: Any, message: str, *_: Any) -> str:
     return message
 
 
+_NO_VARIABLES: set[type] = set()  # types that were met and hold none: words, numbers, places in a file
+
+
+def _variables(self: Any, value: Any) -> list[Any]:
+    """Variables in what an instruction holds. numba asks each value for five types, a million times in a minute."""
+    out: list[Any] = []
+    _gather(value, out)
+    return out
+
+
+def _gather(value: Any, out: list[Any]) -> None:
+    kind = type(value)
+    if kind is ir.Var:
+        out.append(value)
+    elif kind in _NO_VARIABLES:
+        pass
+    elif isinstance(value, dict):
+        for v in value.values():
+            _gather(v, out)
+    elif isinstance(value, ir.Inst):
+        out += value.list_vars()
+    elif isinstance(value, list | tuple):
+        for v in value:
+            _gather(v, out)
+    else:
+        _NO_VARIABLES.add(kind)
+
+
+def _no_annotation(self: Any) -> str:
+    """numba keeps with its machine code each line of the source and the types in it; nobody here reads it."""
+    return ""
+
+
 class _NoCollection(event.Listener):
     """No garbage is collected while a function, with all that it calls, is compiled: there is next to none."""
 
@@ -173,6 +207,10 @@ def _change_numba() -> None:
     library._optimize_functions = _optimise_functions
     of_numbers: Any = types.BaseFunction
     of_numbers.get_call_type = _remembering(of_numbers.get_call_type)
+    instruction: Any = ir.Inst
+    instruction._rec_list_vars = _variables
+    annotation: Any = type_annotations.TypeAnnotation
+    annotation.annotate = _no_annotation
     colours: Any = type(errors.termcolor())
     colours._markup = _plain
     # numba measures for how long LLVM's lock is held, at each of 150,000 calls
