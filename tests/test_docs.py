@@ -127,11 +127,11 @@ NAMES: dict[str, str] = {
     "vaneloop ecu --model": "an option, which the command must have",
 }
 
-# pages whose steps, together, take a processor longer than 5 s
+# pages whose steps, together, take a processor seconds, and whose commands other quick tests run
 DEAR = [
     "README.md",
-    *(f"docs/{name}.md" for name in ("bus", "engine_test", "fmu", "injection", "machines", "own_controller")),
-    *(f"docs/{name}.md" for name in ("python", "real_time", "rig", "your_own_model")),
+    *(f"docs/{name}.md" for name in ("bus", "diagnosis", "engine_test", "fmu", "injection", "machines")),
+    *(f"docs/{name}.md" for name in ("own_controller", "python", "real_time", "replay", "rig", "your_own_model")),
 ]
 # the beginning of a step that takes long -> the quick test that covers what it does
 LONG: dict[str, str] = {

@@ -174,7 +174,10 @@ def test_clearance_of_the_link_is_worth_what_a_longer_link_is():
     )
 
 
-@pytest.mark.parametrize(("stage", "ring"), [("vigv", 0.81), ("vgv1", 0.49), ("vgv2", 0.31)])
+@pytest.mark.parametrize(
+    ("stage", "ring"),
+    [("vigv", 0.81), *(pytest.param(*of, marks=pytest.mark.slow) for of in (("vgv1", 0.49), ("vgv2", 0.31)))],
+)
 def test_nominal_hysteresis_is_traced_to_tenths_of_a_millimetre(stage, ring):
     study = clearance_study(GEOMETRY, stage, getattr(GEOMETRY, stage).hysteresis.value, PINS)
     assert study.made == pytest.approx(getattr(GEOMETRY, stage).hysteresis.value, abs=1e-4)

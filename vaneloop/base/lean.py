@@ -167,7 +167,8 @@ def _gather(value: Any, out: list[Any]) -> None:
         for v in value.values():
             _gather(v, out)
     elif isinstance(value, ir.Inst):
-        out += value.list_vars()
+        instruction: Any = value
+        out += instruction.list_vars()
     elif isinstance(value, list | tuple):
         for v in value:
             _gather(v, out)
