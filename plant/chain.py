@@ -13,6 +13,8 @@ test checks.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from plant import curve, drive, electromechanical, stem
@@ -52,7 +54,9 @@ from plant.linkage import (
     N_PER_STAGE,
     crank,
     ring_angle,
+    ring_angle_of_vane,
     vane_angle,
+    vane_per_ring,
 )
 from plant.parameters import (
     ACCELERATION,
@@ -124,6 +128,7 @@ __all__ = [
     "drive_step",
     "driven_stroke",
     "measured_stroke",
+    "place_rings",
     "rest",
     "rotor_step",
     "sample_lvdt",
@@ -177,13 +182,12 @@ def drive_step(
         return
     target = i_cmd / p[RATED_CURRENT, j]
     a11, a12, a21, a22 = p[VALVE_A11, j], p[VALVE_A12, j], p[VALVE_A21, j], p[VALVE_A22, j]
-    out = p[FLOW_GAIN, j] * speed_factor(p_s, 0.0, p[P_REF, j])
-    back = p[FLOW_GAIN, j] * speed_factor(p_s, 0.0, p[P_REF, j])
+    gain = p[FLOW_GAIN, j] * speed_factor(p_s, 0.0, p[P_REF, j])
     u, du, v, x, y = s[SPOOL, j], s[SPOOL_RATE, j], s[SPEED, j], s[X, j], s[X_LVDT, j]
     for _ in range(substeps):
         u, du = valve_step(u, du, target, a11, a12, a21, a22)
         v_before = v
-        v = u * (out if u > 0.0 else back)
+        v = u * gain
         x = stroke_step(x, v_before, v, p[STROKE, j], dt / substeps)
         y += p[LVDT_FACTOR, j] * (x - y)
     s[SPOOL, j], s[SPOOL_RATE, j], s[SPEED, j], s[X, j], s[X_LVDT, j] = u, du, v, x, y
@@ -266,6 +270,33 @@ def rest(s: np.ndarray, p: np.ndarray, j: int, stroke: float, n_r: float, t_oil:
         stage = stem.prepare(p, j, k)
         s[POT + k, j] = stem.reading(stage, vane_angle(ring, stage.ldp, stage.length))
     curve.begin(s, p, j, t_oil)  # once more, now that the potentiometers have their angles
+
+
+@in_place
+def place_rings(s: np.ndarray, p: np.ndarray, j: int, angles: np.ndarray, n_r: float, t_oil: float) -> None:
+    """Turn each ring of lane ``j``, as far as its play allows, to where its potentiometer gives the angle (rad; NaN =
+    leave it) at speed ``n_r`` (%) and ``t_oil`` (degC). It rests there.
+
+    `stem_angle` itself says what an angle reads as, so every effect counts: what the potentiometer's straight line
+    leaves is taken off by Newton.
+    """
+    g = GEOMETRY
+    c, d = crank(driven_stroke(s, p, j), p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
+    for k in range(int(p[VANE_COUNT, j])):
+        if not math.isfinite(angles[k]):
+            continue
+        stage = stem.prepare(p, j, k)
+        ring = ring_angle_of_vane((angles[k] - stage.offset) / stage.gain, stage.ldp, stage.length)
+        last = math.nan
+        for _ in range(12):
+            s[RING + k, j], s[DRIVEN + k, j], s[BRISTLE + k, j] = ring, ring, 0.0
+            off = stem_angle(s, p, j, k, c, d, n_r, t_oil, 0.0) - angles[k]
+            if abs(off) < 1e-12 or s[RING + k, j] == last:  # there, or at the end of its play
+                break
+            last = s[RING + k, j]
+            ring = last - off / (stage.gain * vane_per_ring(last, stage.ldp, stage.length))
+        s[DRIVEN + k, j], s[BRISTLE + k, j] = s[RING + k, j], 0.0
+        s[POT + k, j] = stem_angle(s, p, j, k, c, d, n_r, t_oil, 0.0)
 
 
 @in_place

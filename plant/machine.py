@@ -9,24 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plant import chain, places
+from plant import chain
 from plant.effect import T_REF, Parameter
-from plant.effects import EFFECTS, ROW, linkage_backlash, pot_bias, pot_gain, states_of
+from plant.effects import EFFECTS, ROW, states_of
 from plant.geometry import Geometry, Schedules, load_schedules
-from plant.linkage import (
-    G_L,
-    G_LDP,
-    G_LE,
-    G_LX0,
-    G_X1,
-    G_Y1,
-    N_CRANK,
-    N_PER_STAGE,
-    crank,
-    ring_angle_of_vane,
-    vane_angle,
-)
-from plant.parameters import GEOMETRY, PLAY, POT_BIAS, AnyPlantTable, Nominal, Supply, derive, load_plant, nominal
+from plant.linkage import G_L, G_LDP, N_CRANK, N_PER_STAGE
+from plant.parameters import GEOMETRY, AnyPlantTable, Nominal, Supply, derive, load_plant, nominal
 from vaneloop.base.vanes import own_rows, same_stages
 
 if TYPE_CHECKING:
@@ -102,25 +90,8 @@ class Plant:
         return s
 
     def place_rings(self, s: np.ndarray, angles: tuple[float, ...], n_r: float = 0.0, t_oil: float = T_REF) -> None:
-        """Set each ring, as far as its play allows, to where the vane angle is the given one (rad; NaN = leave it)."""
-        p = self.p[:, 0]
-        for k, drive in enumerate(self._rings(s[places.X, 0], n_r, t_oil)):
-            if np.isfinite(angles[k]):
-                ldp, lever = self.lever(k)
-                half = 0.5 * linkage_backlash.step(p[PLAY + k], p[places.LINKAGE_BACKLASH + k], lever / ldp)
-                vane = (angles[k] - p[POT_BIAS + k] - p[places.POT_BIAS_ERROR + k]) / p[places.POT_GAIN + k]
-                ring = min(max(ring_angle_of_vane(vane, ldp, lever), drive - half), drive + half)
-                s[places.RING + k, 0] = s[places.DRIVEN + k, 0] = ring
-                s[places.POT + k, 0] = self._reading(ring, k)
-
-    def _rings(self, stroke: float, n_r: float, t_oil: float) -> list[float]:
-        g = self.p[GEOMETRY:, 0]
-        c, d = crank(stroke, g[G_LX0], g[G_X1], g[G_Y1], g[G_LE])
-        return [chain.unloaded_ring_angle(self.p, 0, k, c, d, n_r, t_oil) for k in range(len(self.vanes))]
-
-    def _reading(self, ring: float, k: int) -> float:
-        vane = pot_gain.step(vane_angle(ring, *self.lever(k)), self.p[places.POT_GAIN + k, 0])
-        return vane + pot_bias.step(self.p[POT_BIAS + k, 0], self.p[places.POT_BIAS_ERROR + k, 0])
+        """Set each ring, as far as its play allows, to where its angle reads as the given one (rad; NaN = leave it)."""
+        chain.place_rings(s, self.p, 0, np.array(angles), n_r, t_oil)
 
     def lever(self, k: int) -> tuple[float, float]:
         """Return Ld' and L (m) of stage ``k``: their ratio turns a small angle of the ring into one of the vane."""

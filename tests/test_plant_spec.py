@@ -14,6 +14,7 @@ import pytest
 from plant import (
     Model,
     build_plant,
+    chain,
     chain_lanes,
     curve,
     effects_page,
@@ -496,6 +497,32 @@ def test_a_wider_play_reaches_farther() -> None:
     middle, (ldp, lever) = s[RING, 0], machine.lever(0)
     machine.place_rings(s, (1.5, math.nan, math.nan))
     assert s[RING, 0] == pytest.approx(middle + 0.5 * (p[PLAY, 0] + 0.01 * lever / ldp))
+
+
+def test_a_ring_that_is_placed_reads_as_asked_at_the_first_tick_with_any_effects() -> None:
+    sizes = {
+        "linkage_friction": 0.4, "linkage_wear": 30.0, "thermal_growth": 0.01, "ring_eccentricity": 0.2,
+        "crank_length_error": 0.5, "link_length_error": 0.2, "pot_gain": 1.04, "pot_bias": 0.7,
+    }  # fmt: skip
+    effects = {name: dict.fromkeys(OWN, v) for name, v in sizes.items()} | {"linkage_compliance": {"compliance": 0.1}}
+    curves = {
+        "crank": law(at="linkage.crank", values=[0.1] * 4),
+        "ring": law(at="linkage.vigv_ring", values=[0.3] * 4),
+        "pot": law(at="sensors.vgv1", how="times", values=[0.1] * 4),
+    }
+    machine = Model(effects={**effects, "crank": {}, "ring": {}, "pot": {}}, curves=curves).plant(SHIPPED)
+    s = machine.start(0.024, 90.0, 75.0)
+    machine.place_rings(s, (-1.0, -1.0, -1.0), 90.0, 75.0)
+    low = s[POT : POT + 3, 0].copy()
+    machine.place_rings(s, (1.0, 1.0, 1.0), 90.0, 75.0)
+    resting = 0.5 * (low + s[POT : POT + 3, 0])
+    asked = tuple(resting + np.array([2e-3, -2e-3, 0.0]))
+    machine.place_rings(s, asked, 90.0, 75.0)
+    assert s[POT : POT + 3, 0] == pytest.approx(asked, abs=1e-12)
+    rings = s[RING : RING + 3, 0].copy()
+    chain.vane_step(s, machine.p, 0, 90.0, 75.0)
+    assert s[RING : RING + 3, 0].tolist() == rings.tolist()
+    assert s[POT : POT + 3, 0] == pytest.approx(asked, abs=1e-12)
 
 
 def test_names_of_parameters_belong_to_the_kind_of_actuator() -> None:
