@@ -17,27 +17,10 @@ import math
 
 import numpy as np
 
-from plant import curve, drive, electromechanical, stem
+from plant import curve, drive, electromechanical, engine, lvdt, stem
 from plant.actuator import speed_factor, stroke_step
 from plant.effect import T_REF
-from plant.effects import (
-    CURVES,
-    N_STATE,
-    STATE,
-    acceleration_limit_error,
-    aero_load,
-    lvdt_bias,
-    lvdt_gain,
-    lvdt_nonlinearity,
-    lvdt_thermal_drift,
-    oil_compressibility,
-    oil_viscosity,
-    rotor_lag_error,
-    valve_gain_asymmetry,
-    valve_hysteresis,
-    valve_null_bias,
-)
-from plant.engine import engine_step
+from plant.effects import CURVES, N_STATE, STATE, aero_load
 from plant.linkage import (
     G_AX,
     G_AY,
@@ -59,14 +42,11 @@ from plant.linkage import (
     vane_per_ring,
 )
 from plant.parameters import (
-    ACCELERATION,
-    DECELERATION,
     DRIVE_EFFECTS,
     DRIVE_LOADED,
     FLOW_GAIN,
     GEOMETRY,
     KIND,
-    LAG,
     LVDT_FACTOR,
     LVDT_STEP,
     P_REF,
@@ -85,7 +65,6 @@ from plant.parameters import (
     motor_steps,
 )
 from plant.places import (
-    ACCELERATION_LIMIT_ERROR,
     AERO_LOAD,
     BRISTLE,
     CURRENT,
@@ -94,23 +73,13 @@ from plant.places import (
     GIVE,
     LAGGED,
     LINKAGE_FRICTION,
-    LVDT_BIAS,
-    LVDT_GAIN,
-    LVDT_NONLINEARITY,
-    LVDT_THERMAL_DRIFT,
     N_R,
-    OIL_COMPRESSIBILITY,
-    OIL_VISCOSITY,
     POT,
     READING,
     RING,
-    ROTOR_LAG_ERROR,
     SPEED,
     SPOOL,
     SPOOL_RATE,
-    VALVE_GAIN_ASYMMETRY,
-    VALVE_HYSTERESIS,
-    VALVE_NULL_BIAS,
     X_LVDT,
     X,
 )
@@ -130,10 +99,10 @@ __all__ = [
     "measured_stroke",
     "place_rings",
     "rest",
+    "rest_actuator",
     "rotor_step",
     "sample_lvdt",
     "stem_angle",
-    "straight_reading",
     "straightened",
     "true_stroke",
     "unloaded_ring_angle",
@@ -148,13 +117,12 @@ SUBSTEPS = 10  # plant steps a tick: 10 kHz
 @in_place
 def rotor_step(s: np.ndarray, p: np.ndarray, j: int, n_dem: float, dt: float = TICK) -> None:
     """Engine: one step ``dt`` (s) towards the demand ``n_dem`` (%)."""
-    lag = rotor_lag_error.step(p[LAG, j], p[ROTOR_LAG_ERROR, j])
-    acceleration = acceleration_limit_error.step(p[ACCELERATION, j], p[ACCELERATION_LIMIT_ERROR, j])
+    lag_times = rise_times = 1.0
     if p[CURVES, j] != 0.0:
         n_dem += curve.bend(s, p, j, curve.ENGINE_ADDS)
-        lag *= curve.factor(s, p, j, curve.LAG_TIMES)
-        acceleration *= curve.factor(s, p, j, curve.RISE_TIMES)
-    s[N_R, j] = engine_step(s[N_R, j], n_dem, lag, acceleration, p[DECELERATION, j], dt)
+        lag_times = curve.factor(s, p, j, curve.LAG_TIMES)
+        rise_times = curve.factor(s, p, j, curve.RISE_TIMES)
+    s[N_R, j] = engine.step(s[N_R, j], engine.prepare(p, j), n_dem, dt, lag_times, rise_times)
 
 
 @in_place
@@ -198,19 +166,14 @@ def _drive_step(
     s: np.ndarray, p: np.ndarray, j: int, i_cmd: float, n_r: float, p_s: float, t_oil: float, dt: float, substeps: int
 ) -> None:
     """`drive_step` with every effect: what changes within the step is in `plant.drive`."""
-    i = valve_null_bias.step(i_cmd, p[VALVE_NULL_BIAS, j])
-    y1, y2, y3, y4 = s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j]
-    y1, y2, y3, y4 = valve_hysteresis.step(y1, y2, y3, y4, i, p[VALVE_HYSTERESIS, j], p[VALVE_HYSTERESIS + 1, j])
-    i = valve_hysteresis.mean(y1, y2, y3, y4)
-    gain = oil_viscosity.step(p[FLOW_GAIN, j], t_oil, p[OIL_VISCOSITY, j])
-    load = aero_load.step(n_r, p[AERO_LOAD, j])
+    d, z = drive.prepare(p, j), drive.taken(s, j)
+    y, i = drive.current(drive.remembered(s, j), d, i_cmd, True)
+    gain, load = drive.flow_gain(d, t_oil), drive.load_of(d, n_r)
     if p[CURVES, j] != 0.0:
         i += curve.bend(s, p, j, curve.CURRENT_ADDS)
         gain *= curve.factor(s, p, j, curve.FLOW_TIMES)
         load += curve.bend(s, p, j, curve.LOAD_ADDS)
-    extending, retracting = valve_gain_asymmetry.step(gain, p[VALVE_GAIN_ASYMMETRY, j])
-    d, z = drive.prepare(p, j), drive.taken(s, j)
-    feed = drive.Feed(extending, retracting, speed_factor(p_s, 0.0, p[P_REF, j]), load, 0.5 * d.per_area / p_s)
+    feed = drive.feed(d, gain, load, p_s)
     h, loaded, shut = dt / substeps, p[DRIVE_LOADED, j] != 0.0, 0.0
     bent = p[CURVES, j] != 0.0 and curve.acts(p, j, curve.OPENING_ADDS)
     i_logged = s[curve.S_CURRENT, j]
@@ -221,7 +184,7 @@ def _drive_step(
         z = drive.step(z, d, feed, i, p_s, h, loaded, True, True, True, shut)
     s[curve.S_CURRENT, j] = i_logged
     drive.stored(s, j, z)
-    s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j] = y1, y2, y3, y4
+    drive.told(s, j, y)
 
 
 @in_place
@@ -230,7 +193,7 @@ def _motor_step(
 ) -> None:
     """`drive_step` of an electromechanical actuator."""
     d, z = electromechanical.prepare(p, j, t_oil), electromechanical.taken(s, j)
-    force = aero_load.step(n_r, p[AERO_LOAD, j])
+    force = electromechanical.load_of(d, n_r)
     if p[CURVES, j] != 0.0:
         i_cmd += curve.bend(s, p, j, curve.CURRENT_ADDS)
         force += curve.bend(s, p, j, curve.LOAD_ADDS)
@@ -257,19 +220,24 @@ def rest(s: np.ndarray, p: np.ndarray, j: int, stroke: float, n_r: float, t_oil:
     load = aero_load.step(n_r, p[AERO_LOAD, j])
     if p[CURVES, j] != 0.0:
         load += curve.bend(s, p, j, curve.LOAD_ADDS)
-    s[GIVE, j] = oil_compressibility.step(load, 0.0, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j])
-    for q in range(4):
-        s[CURRENT + q, j] = p[VALVE_NULL_BIAS, j]
-    s[LAGGED, j] = p[VALVE_NULL_BIAS, j]
-    if p[KIND, j] != 0.0:
-        electromechanical.rest(p, s, j, 0.0, load, t_oil)
+    rest_actuator(s, p, j, 0.0, load, t_oil)
     g = GEOMETRY
     c, d = crank(driven_stroke(s, p, j), p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
     for k in range(int(p[VANE_COUNT, j])):
         s[RING + k, j] = s[DRIVEN + k, j] = ring = unloaded_ring_angle(p, j, k, c, d, n_r, t_oil)
         stage = stem.prepare(p, j, k)
-        s[POT + k, j] = stem.reading(stage, vane_angle(ring, stage.ldp, stage.length))
+        s[POT + k, j] = stem.reading(stage, vane_angle(ring, stage.ldp, stage.length), t_oil, 0.0)
     curve.begin(s, p, j, t_oil)  # once more, now that the potentiometers have their angles
+
+
+@inlined
+def rest_actuator(s: np.ndarray, p: np.ndarray, j: int, i_cmd: float, load: float, t_oil: float) -> None:
+    """Let the actuator of lane ``j`` rest, a motor go at its steady speed, under ``i_cmd`` (A) and the ``load`` (N) at
+    ``t_oil`` (degC): its state but for the stroke.
+    """
+    drive.rest(s, p, j, i_cmd, load)
+    if p[KIND, j] != 0.0:
+        electromechanical.rest(p, s, j, i_cmd, load, t_oil)
 
 
 @in_place
@@ -286,7 +254,7 @@ def place_rings(s: np.ndarray, p: np.ndarray, j: int, angles: np.ndarray, n_r: f
         if not math.isfinite(angles[k]):
             continue
         stage = stem.prepare(p, j, k)
-        ring = ring_angle_of_vane((angles[k] - stage.offset) / stage.gain, stage.ldp, stage.length)
+        ring = ring_angle_of_vane((angles[k] - stage.offset) / stage.pot_gain, stage.ldp, stage.length)
         last = math.nan
         for _ in range(12):
             s[RING + k, j], s[DRIVEN + k, j], s[BRISTLE + k, j] = ring, ring, 0.0
@@ -294,7 +262,7 @@ def place_rings(s: np.ndarray, p: np.ndarray, j: int, angles: np.ndarray, n_r: f
             if abs(off) < 1e-12 or s[RING + k, j] == last:  # there, or at the end of its play
                 break
             last = s[RING + k, j]
-            ring = last - off / (stage.gain * vane_per_ring(last, stage.ldp, stage.length))
+            ring = last - off / (stage.pot_gain * vane_per_ring(last, stage.ldp, stage.length))
         s[DRIVEN + k, j], s[BRISTLE + k, j] = s[RING + k, j], 0.0
         s[POT + k, j] = stem_angle(s, p, j, k, c, d, n_r, t_oil, 0.0)
 
@@ -318,14 +286,7 @@ def wake(s: np.ndarray, p: np.ndarray, j: int, i_cmd: float) -> None:
 @in_place
 def measured_stroke(x: float, p: np.ndarray, j: int, t_oil: float) -> float:
     """Return what the LVDT makes of a resting stroke ``x`` (m): its effects without its lags."""
-    x = lvdt_nonlinearity.step(x, p[STROKE, j], p[LVDT_NONLINEARITY, j], p[LVDT_NONLINEARITY + 1, j])
-    return straight_reading(x, p[LVDT_GAIN, j], p[LVDT_THERMAL_DRIFT, j], p[LVDT_BIAS, j], t_oil)
-
-
-@inlined
-def straight_reading(x: float, gain: float, drift: float, bias: float, t_oil: float) -> float:
-    """`measured_stroke` behind the windings' curve."""
-    return lvdt_bias.step(lvdt_thermal_drift.step(lvdt_gain.step(x, gain), t_oil, drift), bias)
+    return lvdt.reading(lvdt.prepare(p, j), x, t_oil)
 
 
 @in_place
@@ -333,16 +294,7 @@ def true_stroke(reading: float, p: np.ndarray, j: int, t_oil: float) -> float:
     """Return the resting stroke (m) that the LVDT gives as ``reading`` (m): the inverse of `measured_stroke`, to 1e-9
     m.
     """
-    off = straight_reading(0.0, p[LVDT_GAIN, j], p[LVDT_THERMAL_DRIFT, j], p[LVDT_BIAS, j], t_oil)
-    x = target = (reading - off) / p[LVDT_GAIN, j]
-    sine, cubic = p[LVDT_NONLINEARITY, j], p[LVDT_NONLINEARITY + 1, j]
-    if sine != 0.0 or cubic != 0.0:
-        for _ in range(12):  # Newton; the error's slope is below 0.7 within the stroke
-            e = lvdt_nonlinearity.step(x, p[STROKE, j], sine, cubic) - target
-            if abs(e) < 1e-10:
-                break
-            x -= e / max(lvdt_nonlinearity.slope(x, p[STROKE, j], sine, cubic), 0.2)
-    return x
+    return lvdt.true_stroke(lvdt.prepare(p, j), reading, t_oil)
 
 
 @inlined
@@ -383,7 +335,7 @@ def unloaded_ring_angle(p: np.ndarray, j: int, k: int, c: float, d: float, n_r: 
     """Return the angle (rad) to which crank direction (c, d) drives the ring of stage ``k``, before its play."""
     stage = stem.prepare(p, j, k)
     theta = ring_angle(c, d, stage.ax, stage.ay, stage.lb, stage.lc, stage.ld)
-    return stem.drive(stage, theta, n_r, t_oil, True)
+    return stem.drive(stage, theta, n_r, t_oil, 0.0, True)
 
 
 @in_place
@@ -395,13 +347,13 @@ def stem_angle(
     """
     stage = stem.prepare(p, j, k)
     theta = ring_angle(c, d, stage.ax, stage.ay, stage.lb, stage.lc, stage.ld)
-    theta, play = stem.drive(stage, theta, n_r, t_oil, True), 0.0
+    theta, play = stem.drive(stage, theta, n_r, t_oil, t, True), 0.0
     if p[CURVES, j] != 0.0:
         theta += curve.bend(s, p, j, curve.RING_ADDS) + curve.bend(s, p, j, curve.RING_ADDS + 1 + k)
         play = curve.bend(s, p, j, curve.PLAY_ADDS) + curve.bend(s, p, j, curve.PLAY_ADDS + 1 + k)
-    z, ring = stem.follow(stem.taken(s, j, k), stage, theta, t_oil, t, stage.friction != 0.0, play)
+    z, ring = stem.follow(stem.taken(s, j, k), stage, theta, t_oil, t, stage.linkage_friction != 0.0, play)
     stem.stored(s, j, k, z)
-    reading = stem.reading(stage, vane_angle(ring, stage.ldp, stage.length))
+    reading = stem.reading(stage, vane_angle(ring, stage.ldp, stage.length), t_oil, t)
     if p[CURVES, j] != 0.0:
         by, adds = curve.bend(s, p, j, curve.POT_TIMES + 1 + k), curve.bend(s, p, j, curve.POT_ADDS + 1 + k)
         reading = curve.bent(reading, by, adds)

@@ -7,24 +7,31 @@ one lane so, the search many side by side (`plant.stages`). Units: SI.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from plant.actuator import speed_factor
 from plant.effects import (
+    aero_load,
     end_stop_shift,
     internal_leakage,
     lvdt_lag,
     oil_compressibility,
+    oil_viscosity,
     piston_friction,
     piston_stiction,
     supply_pressure_droop,
     valve_dead_band,
     valve_flow_saturation,
+    valve_gain_asymmetry,
+    valve_hysteresis,
     valve_lag,
+    valve_null_bias,
 )
 from plant.parameters import (
     AREA,
+    FLOW_GAIN,
     LVDT_FACTOR,
     LVDT_SHARE,
     P_REF,
@@ -37,28 +44,29 @@ from plant.parameters import (
     VALVE_SHARE,
 )
 from plant.places import (
+    CURRENT,
     END_STOP_SHIFT,
     FRICTION,
     GIVE,
-    INTERNAL_LEAKAGE,
     LAGGED,
     OIL_COMPRESSIBILITY,
-    PISTON_FRICTION,
-    PISTON_STICTION,
     READING,
     SPEED,
     SPOOL,
     SPOOL_RATE,
-    SUPPLY_PRESSURE_DROOP,
     VALVE_DEAD_BAND,
-    VALVE_FLOW_SATURATION,
+    VALVE_NULL_BIAS,
     X_LVDT,
     X,
 )
+from plant.prepared import with_effects
 from plant.valve import valve_step
 from vaneloop.base.compiled import inlined
 
-__all__ = ["Drive", "DriveState", "Feed", "prepare", "step", "stored", "taken"]
+__all__ = [
+    "Drive", "DriveState", "Feed", "Plays", "current", "feed", "flow_gain", "load_of", "prepare", "remembered", "rest",
+    "step", "stored", "taken", "told",
+]  # fmt: skip
 
 
 class DriveState(NamedTuple):
@@ -85,15 +93,24 @@ class DriveState(NamedTuple):
     reading: float
 
 
-class Drive(NamedTuple):
-    """What a step needs of the machine, worked out once.
+class Plays(NamedTuple):
+    """What the valve's hysteresis remembers: four currents (A)."""
+
+    current_1: float
+    current_2: float
+    current_3: float
+    current_4: float
+
+
+class _Drive(NamedTuple):
+    """What a step needs of the machine, worked out once; behind these fields those of the effects at valve, supply and
+    actuator (`plant.prepared`).
 
     rated, valve_share   A; share of the way that the valve's lag goes in a step
     a11 .. a22           the spool's exact step
-    overlap, limit, roundness   valve: dead band (-), flow limit (m/s) and its corner
-    droop, leakage       supply and internal leakage
-    friction, excess, stribeck  N, N, m/s
-    stiffness, compliance, drag N/m of the trapped oil; m/N, N/(m/s)
+    flow, p_ref          m/s at full spool and p_ref (Pa)
+    overlap              -, of the valve's lands: its dead band
+    stiffness            N/m of the trapped oil
     per_p_ref, per_area, per_stroke  1/Pa, 1/m2, 1/m
     low, high            m, end stops
     lvdt_factor, lvdt_share     shares of the way that the LVDT's lags go in a step
@@ -105,17 +122,10 @@ class Drive(NamedTuple):
     a12: float
     a21: float
     a22: float
+    flow: float
+    p_ref: float
     overlap: float
-    limit: float
-    roundness: float
-    droop: float
-    leakage: float
-    friction: float
-    excess: float
-    stribeck: float
     stiffness: float
-    compliance: float
-    drag: float
     per_p_ref: float
     per_area: float
     per_stroke: float
@@ -138,27 +148,20 @@ class Feed(NamedTuple):
 
 
 @inlined
-def prepare(p: np.ndarray, j: int) -> Drive:
-    """Return what lane ``j`` of the parameters needs for its steps."""
+def _numbers(p: np.ndarray, j: int) -> _Drive:
+    """Return what lane ``j`` of the parameters needs for its steps, but for the effects' own numbers."""
     low, high = end_stop_shift.step(p[STROKE, j], p[END_STOP_SHIFT, j])
-    return Drive(
+    return _Drive(
         p[RATED_CURRENT, j],
         p[VALVE_SHARE, j],
         p[VALVE_A11, j],
         p[VALVE_A12, j],
         p[VALVE_A21, j],
         p[VALVE_A22, j],
+        p[FLOW_GAIN, j],
+        p[P_REF, j],
         p[VALVE_DEAD_BAND, j] / p[RATED_CURRENT, j],
-        p[VALVE_FLOW_SATURATION, j],
-        p[VALVE_FLOW_SATURATION + 1, j],
-        p[SUPPLY_PRESSURE_DROOP, j],
-        p[INTERNAL_LEAKAGE, j],
-        p[PISTON_FRICTION, j],
-        p[PISTON_STICTION, j],
-        p[PISTON_STICTION + 1, j],
         1.0 / (oil_compressibility.NOMINAL + p[OIL_COMPRESSIBILITY, j]),
-        p[OIL_COMPRESSIBILITY, j],
-        p[OIL_COMPRESSIBILITY + 1, j],
         1.0 / p[P_REF, j],
         1.0 / p[AREA, j],
         1.0 / p[STROKE, j],
@@ -167,6 +170,9 @@ def prepare(p: np.ndarray, j: int) -> Drive:
         p[LVDT_FACTOR, j],
         p[LVDT_SHARE, j],
     )
+
+
+Drive, prepare = with_effects(_Drive, _numbers, "p, j", "valve", "supply", "actuator")
 
 
 @inlined
@@ -195,9 +201,69 @@ def stored(s: np.ndarray, j: int, z: DriveState) -> None:
 
 
 @inlined
+def remembered(s: np.ndarray, j: int) -> Plays:
+    """Return what the valve of lane ``j`` remembers."""
+    return Plays(s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j])
+
+
+@inlined
+def told(s: np.ndarray, j: int, y: Plays) -> None:
+    """Let the valve of lane ``j`` remember it."""
+    s[CURRENT, j], s[CURRENT + 1, j], s[CURRENT + 2, j], s[CURRENT + 3, j] = (
+        y.current_1,
+        y.current_2,
+        y.current_3,
+        y.current_4,
+    )
+
+
+@inlined
+def rest(s: np.ndarray, p: np.ndarray, j: int, i_cmd: float, load: float) -> None:
+    """Let valve and oil of lane ``j`` rest under the command ``i_cmd`` (A) and the ``load`` (N)."""
+    i = valve_null_bias.step(i_cmd, p[VALVE_NULL_BIAS, j])
+    told(s, j, Plays(i, i, i, i))
+    s[LAGGED, j] = i
+    s[GIVE, j] = oil_compressibility.step(load, 0.0, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j])
+
+
+@inlined
+def current(y: Plays, d: Any, i_cmd: float, memory: bool) -> tuple[Plays, float]:
+    """Return what the valve remembers under the command ``i_cmd`` (A), and the current (A) that moves the spool.
+
+    memory  False leaves out its hysteresis: for lanes where it is neutral
+    """
+    i = valve_null_bias.step(i_cmd, d.valve_null_bias)
+    if not memory:
+        return y, i
+    y1, y2, y3, y4 = valve_hysteresis.step(
+        y.current_1, y.current_2, y.current_3, y.current_4, i, d.valve_hysteresis_width, d.valve_hysteresis_spread
+    )
+    return Plays(y1, y2, y3, y4), valve_hysteresis.mean(y1, y2, y3, y4)
+
+
+@inlined
+def flow_gain(d: Any, t_oil: float) -> float:
+    """Return the flow gain (m/s) at ``t_oil`` (degC), the mean of both directions."""
+    return oil_viscosity.step(d.flow, t_oil, d.oil_viscosity)
+
+
+@inlined
+def load_of(d: Any, n_r: float) -> float:
+    """Return the load (N) against extension at the speed ``n_r`` (%)."""
+    return aero_load.step(n_r, d.aero_load)
+
+
+@inlined
+def feed(d: Any, gain: float, load: float, p_s: float) -> Feed:
+    """Return what is fed at the flow gain ``gain`` (m/s), the ``load`` (N) and the supply pressure ``p_s`` (Pa)."""
+    extending, retracting = valve_gain_asymmetry.step(gain, d.valve_gain_asymmetry)
+    return Feed(extending, retracting, speed_factor(p_s, 0.0, d.p_ref), load, 0.5 * d.per_area / p_s)
+
+
+@inlined
 def step(
     z: DriveState,
-    d: Drive,
+    d: Any,
     f: Feed,
     i: float,
     p_s: float,
@@ -225,24 +291,26 @@ def step(
         against = p_load if opening > 0.0 else -p_load
         speed = opening * (gain * math.sqrt(max(0.0, (p_s - against) * d.per_p_ref)))
         if lossy:
-            speed = supply_pressure_droop.step(speed, p_s - against, d.droop)
-            speed = valve_flow_saturation.step(speed, d.limit, d.roundness)
-            speed = internal_leakage.step(speed, p_load, d.drag * d.per_area, d.leakage)
+            speed = supply_pressure_droop.step(speed, p_s - against, d.supply_pressure_droop)
+            speed = valve_flow_saturation.step(speed, d.valve_flow_saturation_limit, d.valve_flow_saturation_roundness)
+            speed = internal_leakage.step(speed, p_load, d.oil_compressibility_drag * d.per_area, d.internal_leakage)
         elif limited:
-            speed = valve_flow_saturation.corner(speed, d.limit)
+            speed = valve_flow_saturation.corner(speed, d.valve_flow_saturation_limit)
         travel = 0.5 * (z.speed + speed) * dt
-        level = piston_stiction.step(d.friction, speed, d.excess, d.stribeck) if sticky else d.friction
+        level = d.piston_friction
+        if sticky:
+            level = piston_stiction.step(level, speed, d.piston_stiction_excess, d.piston_stiction_speed)
         r = piston_friction.off_middle(z.x, d.per_stroke)
         k = 1.0 - r * r
         force = piston_friction.step(z.force, travel, level, d.stiffness / k)
         moved = force - z.force
         off_centre, back = piston_friction.recentre(z.off_centre, r * moved, abs(travel) * d.stiffness * f.half_share)
-        give = oil_compressibility.step(f.load, speed, d.compliance, d.drag)
+        give = oil_compressibility.step(f.load, speed, d.oil_compressibility_compliance, d.oil_compressibility_drag)
         travel += (give - z.give) - (k * moved + r * back) / d.stiffness
     else:
         speed = opening * (gain * f.root)
         if limited:
-            speed = valve_flow_saturation.corner(speed, d.limit)
+            speed = valve_flow_saturation.corner(speed, d.valve_flow_saturation_limit)
         travel = 0.5 * (z.speed + speed) * dt
     x = min(max(z.x + travel, d.low), d.high)
     x_lvdt = z.x_lvdt + d.lvdt_factor * (x - z.x_lvdt)

@@ -30,11 +30,12 @@ self-locking); Moreau, Numerical aspects of the sweeping process (1999) (implici
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from plant.effects import (
+    aero_load,
     amplifier_dead_band,
     amplifier_lag,
     amplifier_offset,
@@ -72,27 +73,36 @@ from plant.parameters import (
 )
 from plant.places import (
     AHEAD,
-    AMPLIFIER_DEAD_BAND,
-    AMPLIFIER_OFFSET,
     BENT,
     DEMANDED,
     END_STOP_SHIFT,
-    GEAR_BACKLASH,
     I_MOTOR,
     MOTOR_SPEED,
     MOTOR_TORQUE_CONSTANT_ERROR,
     READING,
     SCREW_FRICTION_ERROR,
-    SCREW_PITCH_ERROR,
     SPEED,
     SPEED_INTEGRAL,
     TACHO_THERMAL_DRIFT,
     X_LVDT,
     X,
 )
+from plant.prepared import with_effects
 from vaneloop.base.compiled import inlined
 
-__all__ = ["Motor", "MotorState", "demand", "load_torques", "prepare", "rest", "sense", "step", "stored", "taken"]
+__all__ = [
+    "Motor",
+    "MotorState",
+    "demand",
+    "load_of",
+    "load_torques",
+    "prepare",
+    "rest",
+    "sense",
+    "step",
+    "stored",
+    "taken",
+]
 
 
 class MotorState(NamedTuple):
@@ -121,10 +131,11 @@ class MotorState(NamedTuple):
     reading: float
 
 
-class Motor(NamedTuple):
-    """What a step needs of the machine, worked out once.
+class _Motor(NamedTuple):
+    """What a step needs of the machine, worked out once; behind these fields those of the effects at amplifier, motor,
+    screw and actuator (`plant.prepared`).
 
-    offset, half, per_rated, rated  A, A, 1/A, rad/s: command to speed demand
+    per_rated, rated                1/A, rad/s: command to speed demand
     lag_share, current_share        shares of the way that amplifier_lag and the current loop go in a step
     gain, rate                      A s/rad, A/rad: speed loop
     peak, voltage, per_ohm          A, V, 1/Ohm
@@ -132,13 +143,11 @@ class Motor(NamedTuple):
     inertia, viscous                kg m2, N m s/rad
     r, friction, loss               m/rad, N, 1/eta - 1
     per_stiffness                   m/(N m), of the load's torque
-    play, lead, amplitude, phase    m, m, m, rad
+    lead                            m
     low, high                       m, end stops
     lvdt_factor, lvdt_share         shares of the way that the LVDT's lags go in a plant step
     """
 
-    offset: float
-    half: float
     per_rated: float
     rated: float
     lag_share: float
@@ -155,10 +164,7 @@ class Motor(NamedTuple):
     friction: float
     loss: float
     per_stiffness: float
-    play: float
     lead: float
-    amplitude: float
-    phase: float
     low: float
     high: float
     lvdt_factor: float
@@ -166,13 +172,12 @@ class Motor(NamedTuple):
 
 
 @inlined
-def prepare(p: np.ndarray, j: int, temperature: float) -> Motor:
-    """Return what lane ``j`` of the parameters needs for its steps at ``temperature`` (degC)."""
+def _numbers(p: np.ndarray, j: int, temperature: float) -> _Motor:
+    """Return what lane ``j`` of the parameters needs for its steps at ``temperature`` (degC), but for the effects' own
+    numbers."""
     low, high = end_stop_shift.step(p[STROKE, j], p[END_STOP_SHIFT, j])
     r = p[SCREW_LEAD, j] / (2.0 * math.pi * p[GEAR_RATIO, j])
-    return Motor(
-        p[AMPLIFIER_OFFSET, j],
-        p[AMPLIFIER_DEAD_BAND, j],
+    return _Motor(
         1.0 / p[RATED_CURRENT, j],
         tacho_thermal_drift.step(p[RATED_SPEED, j] / r, temperature, p[TACHO_THERMAL_DRIFT, j]),
         p[AMPLIFIER_SHARE, j],
@@ -189,15 +194,15 @@ def prepare(p: np.ndarray, j: int, temperature: float) -> Motor:
         screw_friction.step(p[SCREW_FRICTION, j], p[SCREW_FRICTION_ERROR, j]),
         1.0 / p[SCREW_EFFICIENCY, j] - 1.0,
         1.0 / (p[SCREW_STIFFNESS, j] * r),
-        p[GEAR_BACKLASH, j],
         p[SCREW_LEAD, j],
-        p[SCREW_PITCH_ERROR, j],
-        p[SCREW_PITCH_ERROR + 1, j],
         low,
         high,
         p[LVDT_FACTOR, j],
         p[LVDT_SHARE, j],
     )
+
+
+Motor, prepare = with_effects(_Motor, _numbers, "p, j, temperature", "amplifier", "motor", "screw", "actuator")
 
 
 @inlined
@@ -226,13 +231,19 @@ def stored(s: np.ndarray, j: int, z: MotorState) -> None:
 
 
 @inlined
-def demand(d: Motor, i_read: float) -> float:
+def demand(d: Any, i_read: float) -> float:
     """Return the speed (rad/s) that the amplifier asks for at the command ``i_read`` (A) behind its lag."""
-    return d.rated * (amplifier_dead_band.step(i_read, d.half) * d.per_rated)
+    return d.rated * (amplifier_dead_band.step(i_read, d.amplifier_dead_band) * d.per_rated)
 
 
 @inlined
-def load_torques(d: Motor, force: float) -> tuple[float, float]:
+def load_of(d: Any, n_r: float) -> float:
+    """Return the load (N) against extension at the speed ``n_r`` (%)."""
+    return aero_load.step(n_r, d.aero_load)
+
+
+@inlined
+def load_torques(d: Any, force: float) -> tuple[float, float]:
     """Return the torque (N m) of the load ``force`` (N against extension) at the motor, and the most that friction
     takes.
     """
@@ -245,24 +256,24 @@ def rest(p: np.ndarray, s: np.ndarray, j: int, i_cmd: float, force: float, tempe
     for the stroke.
     """
     d = prepare(p, j, temperature)
-    read = amplifier_offset.step(i_cmd, d.offset)
+    read = amplifier_offset.step(i_cmd, d.amplifier_offset)
     w = demand(d, read)
     load, friction = load_torques(d, force)
     torque = load + d.viscous * w + (friction if w > 0.0 else -friction if w < 0.0 else 0.0)
     i = min(max(torque / d.torque, -d.peak), d.peak)
     s[DEMANDED, j], s[SPEED_INTEGRAL, j], s[I_MOTOR, j], s[MOTOR_SPEED, j], s[SPEED, j] = read, i, i, w, d.r * w
     s[BENT, j] = load * d.per_stiffness
-    s[AHEAD, j] = 0.5 * d.play if w > 0.0 else -0.5 * d.play if w < 0.0 else 0.0
+    s[AHEAD, j] = 0.5 * d.gear_backlash if w > 0.0 else -0.5 * d.gear_backlash if w < 0.0 else 0.0
 
 
 @inlined
-def step(z: MotorState, d: Motor, i_cmd: float, load: float, friction: float, h: float, swaying: bool) -> MotorState:
+def step(z: MotorState, d: Any, i_cmd: float, load: float, friction: float, h: float, swaying: bool) -> MotorState:
     """One step ``h`` (s) of the motor and the rod under the command ``i_cmd`` (A) and the torques (N m) of
     `load_torques`.
 
     swaying  False leaves out the screw's pitch error: for lanes where it is neutral
     """
-    demanded = amplifier_lag.step(z.demanded, amplifier_offset.step(i_cmd, d.offset), d.lag_share)
+    demanded = amplifier_lag.step(z.demanded, amplifier_offset.step(i_cmd, d.amplifier_offset), d.lag_share)
     e = demand(d, demanded) - z.w
     wanted = d.gain * e + z.integral
     back = d.torque * z.w
@@ -275,9 +286,9 @@ def step(z: MotorState, d: Motor, i_cmd: float, load: float, friction: float, h:
     share = h / (d.inertia + h * d.viscous)
     w = share * (d.inertia / h * z.w + d.torque * i - load)
     w -= min(max(w, -share * friction), share * friction)
-    ahead, way = gear_backlash.step(z.ahead, 0.5 * (z.w + w) * d.r * h, d.play)
+    ahead, way = gear_backlash.step(z.ahead, 0.5 * (z.w + w) * d.r * h, d.gear_backlash)
     if swaying:
-        way = screw_pitch_error.step(z.x, way, d.lead, d.amplitude, d.phase)
+        way = screw_pitch_error.step(z.x, way, d.lead, d.screw_pitch_error_amplitude, d.screw_pitch_error_phase)
     bent = load * d.per_stiffness
     free = z.x + (way - (bent - z.bent))
     x = min(max(free, d.low), d.high)
@@ -286,7 +297,7 @@ def step(z: MotorState, d: Motor, i_cmd: float, load: float, friction: float, h:
 
 
 @inlined
-def sense(z: MotorState, d: Motor) -> MotorState:
+def sense(z: MotorState, d: Any) -> MotorState:
     """The LVDT's step, at the end of a plant step."""
     x_lvdt = z.x_lvdt + d.lvdt_factor * (z.x - z.x_lvdt)
     reading = lvdt_lag.step(z.reading, x_lvdt, d.lvdt_share)

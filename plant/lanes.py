@@ -15,7 +15,9 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-__all__ = ["block", "filler", "getter", "on_stack", "putter", "wide_vectors"]
+from vaneloop.base.lean import called_by_code
+
+__all__ = ["block", "compiled_text", "filler", "getter", "on_stack", "putter", "wide_vectors"]
 
 
 def block(
@@ -37,10 +39,11 @@ def block(
     return np.dtype([(name, np.float64, shape) for name, shape in zip([*once, *several], shapes, strict=True)])
 
 
-def _compiled(source: str, space: dict[str, Any]) -> Callable[..., Any]:
+def compiled_text(source: str, space: dict[str, Any]) -> Callable[..., Any]:
+    """Compiled function ``f`` of a text of Python, inlined where it is called; ``space``: names that the text uses."""
     exec(source, space)  # noqa: S102
-    out: Callable[..., Any] = njit(error_model="numpy", forceinline=True)(space["f"])
-    return out
+    out: Callable[..., Any] = njit(error_model="numpy", forceinline=True, no_cfunc_wrapper=True)(space["f"])
+    return called_by_code(out)
 
 
 def getter(kind: type[NamedTuple], which: str = "", prefix: str = "", **known: float) -> Callable[..., Any]:
@@ -51,14 +54,14 @@ def getter(kind: type[NamedTuple], which: str = "", prefix: str = "", **known: f
     """
     at = f"{which}, j" if which else "j"
     fields = (repr(known[n]) if n in known else f"b.{prefix}{n}[{at}]" for n in kind._fields)
-    return _compiled(f"def f(b, {at}): return Kind({', '.join(fields)})", {"Kind": kind})
+    return compiled_text(f"def f(b, {at}): return Kind({', '.join(fields)})", {"Kind": kind})
 
 
 def putter(kind: type[NamedTuple], which: str = "", prefix: str = "") -> Callable[..., Any]:
     """Compiled function (block, lane, ``kind``) that puts it there; ``which`` and ``prefix`` as of `getter`."""
     at = f"{which}, j" if which else "j"
     lines = "".join(f"    b.{prefix}{n}[{at}] = v.{n}\n" for n in kind._fields)
-    return _compiled(f"def f(b, {at}, v):\n{lines}", {})
+    return compiled_text(f"def f(b, {at}, v):\n{lines}", {})
 
 
 def filler(names: dict[str, int], prefix: str, put: bool) -> Callable[..., Any]:
@@ -72,7 +75,7 @@ def filler(names: dict[str, int], prefix: str, put: bool) -> Callable[..., Any]:
         for q in range(count or 1):
             own, there = (f"v.{name}[{q}]", f"{name}[{q}, j]") if count else (f"v.{name}", f"{name}[j]")
             lines.append(f"    b.{prefix}{there} = {own}\n" if put else f"    {own} = b.{prefix}{there}\n")
-    return _compiled(f"def f(b, j, v):\n{''.join(lines)}", {})
+    return compiled_text(f"def f(b, j, v):\n{''.join(lines)}", {})
 
 
 def _on_stack(_: Any, layout: Any) -> Any:

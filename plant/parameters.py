@@ -106,6 +106,7 @@ __all__ = [
     "ElectromechanicalTable",
     "Nominal",
     "PlantTable",
+    "changed",
     "derive",
     "derive_lane",
     "load_plant",
@@ -339,7 +340,7 @@ def nominal(table: AnyPlantTable, geometry: Geometry) -> list[Nominal]:
     return out
 
 
-_NEUTRAL = np.concatenate([np.zeros(N_NOMINAL), NEUTRAL])
+_NEUTRAL = np.concatenate([np.zeros(N_NOMINAL), NEUTRAL])  # of an effect: where it does nothing
 _DRIVE_ROWS = np.array(rows_at("valve", "supply", "actuator", "lvdt"))
 _LOAD_ROWS = np.array(
     [r for r in rows_at("supply", "actuator") if r not in (ROW["oil_viscosity"], ROW["end_stop_shift"])]
@@ -376,9 +377,9 @@ def derive_lane(p: np.ndarray, j: int, dt: float, tick: float) -> None:
         p[CURRENT_SHARE, j] = lag_factor(1.0 / (2.0 * math.pi * p[CURRENT_BANDWIDTH, j]), h)
         p[AMPLIFIER_SHARE, j] = lag_factor(p[_AMPLIFIER_LAG, j], h)
     # a motor has no short way
-    p[DRIVE_EFFECTS, j] = 1.0 if p[KIND, j] != 0.0 else _changed(p, j, _DRIVE_ROWS)
-    p[DRIVE_LOADED, j] = _changed(p, j, _LOAD_ROWS)
-    p[VANE_EFFECTS, j] = _changed(p, j, _VANE_ROWS)
+    p[DRIVE_EFFECTS, j] = 1.0 if p[KIND, j] != 0.0 else changed(p, j, _DRIVE_ROWS)
+    p[DRIVE_LOADED, j] = changed(p, j, _LOAD_ROWS)
+    p[VANE_EFFECTS, j] = changed(p, j, _VANE_ROWS)
     if p[CURVES, j] != 0.0:  # nor have curves
         p[DRIVE_EFFECTS, j] = p[VANE_EFFECTS, j] = 1.0
         if acts(p, j, LOAD_ADDS):
@@ -386,7 +387,7 @@ def derive_lane(p: np.ndarray, j: int, dt: float, tick: float) -> None:
 
 
 @in_place
-def _changed(p: np.ndarray, j: int, rows: np.ndarray) -> float:
+def changed(p: np.ndarray, j: int, rows: np.ndarray) -> float:
     """Return 1 where any of these rows is not neutral, else 0."""
     for row in rows:
         if p[row, j] != _NEUTRAL[row]:

@@ -23,138 +23,37 @@ from plant.effect import DEG, KINDS, MOTOR, STAGES
 from plant.effects import (
     EFFECTS,
     ROW,
-    amplifier_dead_band,
-    amplifier_lag,
-    amplifier_offset,
     can_delay,
-    controller_gain_error,
-    crank_length_error,
-    end_stop_shift,
     frame_hold,
-    gear_backlash,
-    internal_leakage,
-    link_length_error,
-    linkage_backlash,
     linkage_compliance,
     linkage_friction,
-    linkage_wear,
-    lvdt_bias,
-    lvdt_gain,
-    lvdt_lag,
     lvdt_nonlinearity,
-    lvdt_thermal_drift,
-    motor_torque_constant_error,
     oil_compressibility,
-    oil_viscosity,
     piston_friction,
     piston_stiction,
-    pot_bias,
-    pot_gain,
-    pot_lag,
     ring_eccentricity,
-    rotor_lag_error,
-    schedule_error,
-    screw_friction,
-    screw_pitch_error,
     supply_pressure_droop,
-    tacho_thermal_drift,
-    thermal_growth,
-    trend_threshold_error,
-    valve_dead_band,
-    valve_flow_saturation,
-    valve_gain_asymmetry,
     valve_hysteresis,
-    valve_lag,
-    valve_null_bias,
 )
-from plant.effects import acceleration_limit_error as acceleration_error
-from plant.effects import aero_load as aero
 from plant.effects_page import page
 from plant.geometry import vane_angles
 from plant.layout import GEOMETRY, N_NOMINAL
 from plant.linkage import G_LB, G_LC, N_CRANK, N_PER_STAGE
 from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, VANE_EFFECTS, derive
 from plant.series import arctangent, tangent
-from plant.stages import actuator, actuator_run, engine_run, hydraulic_blocks, linkage, linkage_run, step_currents
+from plant.stages import actuator_run, engine_run, linkage_run, step_currents
 from plant.stages.blocks import W
 from plant.stages.linkage import SOME
 from tests import columns as fw
 from tests.conftest import ROOT, examples
+from tests.effect_table import EXAMPLES
 from vaneloop.base.errors import InputError
 
 NAMES = tuple(EFFECTS)
 MACHINE = build_plant()
 OWN = {name: tuple(MACHINE.parameters_of(name).values()) for name in NAMES}  # of the shipped machine
-# the library that docs and other people's tools count on
-PROMISED = {
-    *("can_delay", "frame_hold", "schedule_error", "trend_threshold_error", "controller_gain_error"),
-    *("rotor_lag_error", "acceleration_limit_error"),
-    *(
-        "valve_null_bias",
-        "valve_dead_band",
-        "valve_hysteresis",
-        "valve_flow_saturation",
-        "valve_lag",
-        "valve_gain_asymmetry",
-    ),
-    *("supply_pressure_droop", "oil_viscosity"),
-    *("piston_friction", "piston_stiction", "internal_leakage", "oil_compressibility", "aero_load", "end_stop_shift"),
-    *("lvdt_bias", "lvdt_gain", "lvdt_nonlinearity", "lvdt_lag", "lvdt_thermal_drift"),
-    *("linkage_backlash", "linkage_compliance", "linkage_friction", "linkage_wear", "thermal_growth"),
-    *("crank_length_error", "link_length_error", "ring_eccentricity"),
-    *("amplifier_offset", "amplifier_dead_band", "amplifier_lag", "tacho_thermal_drift"),
-    *("motor_torque_constant_error", "screw_friction", "gear_backlash", "screw_pitch_error"),
-    *("pot_bias", "pot_gain", "pot_lag"),
-}
 
-# a plain size of each effect, in declared units; per-stage ones on VGV1
-SIZES: dict[str, dict[str, float]] = {
-    "can_delay": {"delay": 0.1},
-    "frame_hold": {"period": 0.1},
-    "schedule_error": {"offset": 0.5},
-    "trend_threshold_error": {"factor": 4.0},
-    "controller_gain_error": {"factor": 1.3},
-    "rotor_lag_error": {"lag": 0.4},
-    "acceleration_limit_error": {"limit": -2.0},
-    "valve_null_bias": {"bias": 1.0},
-    "valve_dead_band": {"half_width": 1.2},
-    "valve_hysteresis": {"width": 1.5, "spread": 0.7},
-    "valve_flow_saturation": {"limit": 40.0, "roundness": 0.4},
-    "valve_lag": {"time_constant": 0.01},
-    "valve_gain_asymmetry": {"ratio": 1.2},
-    "supply_pressure_droop": {"droop": 40.0},
-    "oil_viscosity": {"coefficient": -0.004},
-    "piston_friction": {"force": 2000.0},
-    "piston_stiction": {"excess": 2000.0, "speed": 4.0},
-    "internal_leakage": {"coefficient": 1.0},
-    "oil_compressibility": {"compliance": 0.1},
-    "aero_load": {"force": 4000.0},
-    "end_stop_shift": {"shift": 4.0},
-    "lvdt_bias": {"bias": 0.4},
-    "lvdt_gain": {"factor": 1.03},
-    "lvdt_nonlinearity": {"amplitude": 0.3, "cubic": -0.1},
-    "lvdt_lag": {"time_constant": 0.01},
-    "lvdt_thermal_drift": {"coefficient": 0.01},
-    "linkage_backlash": {"vgv1": 0.5},
-    "linkage_compliance": {"compliance": 0.1},
-    "linkage_friction": {"vgv1": 0.5},
-    "linkage_wear": {"vgv1": 50.0},
-    "thermal_growth": {"vgv1": 0.02},
-    "crank_length_error": {"vgv1": 1.0},
-    "link_length_error": {"vgv1": 0.5},
-    "ring_eccentricity": {"vgv1": 0.2, "phase": 60.0},
-    "pot_bias": {"vgv1": 0.5},
-    "pot_gain": {"vgv1": 1.03},
-    "pot_lag": {"vgv1": 0.05},
-    "amplifier_offset": {"offset": 1.0},
-    "amplifier_dead_band": {"half_width": 1.2},
-    "amplifier_lag": {"time_constant": 0.01},
-    "tacho_thermal_drift": {"coefficient": -0.004},
-    "motor_torque_constant_error": {"factor": 0.6},
-    "screw_friction": {"force": 1000.0},
-    "gear_backlash": {"width": 0.1},
-    "screw_pitch_error": {"amplitude": 0.05, "phase": 30.0},
-}
+SIZES = {name: example.plain for name, example in EXAMPLES.items()}
 ELECTRIC = [n for n in NAMES if EFFECTS[n].kinds == MOTOR]
 
 
@@ -200,8 +99,8 @@ def speed(machine, current, **conditions):
 # ---- the registry ----------------------------------------------------------------------------------------------------
 
 
-def test_library_holds_the_promised_names() -> None:
-    assert set(NAMES) == PROMISED == set(SIZES)
+def test_library_holds_what_the_tests_know() -> None:
+    assert set(NAMES) == set(EXAMPLES)
 
 
 def test_rows_follow_the_nominal_ones_without_gaps() -> None:
@@ -225,55 +124,6 @@ def test_page_on_effects_is_current() -> None:
 
 # ---- neutral is an identity ------------------------------------------------------------------------------------------
 
-# effect -> (result of its step at neutral, what it must be), for any numbers a, b and any positive c
-IDENTITIES = {
-    "can_delay": lambda n, a, b, c: (can_delay.step(a, *n), a),
-    "frame_hold": lambda n, a, b, c: (frame_hold.step(a, *n), a),
-    "schedule_error": lambda n, a, b, c: (schedule_error.step(a, *n), a),
-    "trend_threshold_error": lambda n, a, b, c: (trend_threshold_error.step(a, *n), a),
-    "controller_gain_error": lambda n, a, b, c: (controller_gain_error.step(a, *n), a),
-    "rotor_lag_error": lambda n, a, b, c: (rotor_lag_error.step(c + 0.01, *n), c + 0.01),
-    "acceleration_limit_error": lambda n, a, b, c: (acceleration_error.step(c + 0.01, *n), c + 0.01),
-    "valve_null_bias": lambda n, a, b, c: (valve_null_bias.step(a, *n), a),
-    "valve_dead_band": lambda n, a, b, c: (valve_dead_band.step(a, *n), a),
-    "valve_hysteresis": lambda n, a, b, c: (valve_hysteresis.mean(*valve_hysteresis.step(b, 0.0, -b, c, a, *n)), a),
-    "valve_flow_saturation": lambda n, a, b, c: (valve_flow_saturation.step(a, *n), a),
-    "valve_lag": lambda n, a, b, c: (valve_lag.step(b, a, 1.0), a),
-    "valve_gain_asymmetry": lambda n, a, b, c: (valve_gain_asymmetry.step(a, *n), (a, a)),
-    "supply_pressure_droop": lambda n, a, b, c: (supply_pressure_droop.step(a, b, *n), a),
-    "oil_viscosity": lambda n, a, b, c: (oil_viscosity.step(a, b, *n), a),
-    "piston_friction": lambda n, a, b, c: (piston_friction.step(0.0, a, *n, c), 0.0),
-    "piston_stiction": lambda n, a, b, c: (piston_stiction.step(a, b, *n), a),
-    "internal_leakage": lambda n, a, b, c: (internal_leakage.step(a, b, c, *n), a),
-    "oil_compressibility": lambda n, a, b, c: (oil_compressibility.step(0.0, a, *n), 0.0),
-    "aero_load": lambda n, a, b, c: (aero.step(a, *n), 0.0),
-    "end_stop_shift": lambda n, a, b, c: (end_stop_shift.step(c, *n), (0.0, c)),
-    "lvdt_bias": lambda n, a, b, c: (lvdt_bias.step(a, *n), a),
-    "lvdt_gain": lambda n, a, b, c: (lvdt_gain.step(a, *n), a),
-    "lvdt_nonlinearity": lambda n, a, b, c: (lvdt_nonlinearity.step(a, c, *n), a),
-    "lvdt_lag": lambda n, a, b, c: (lvdt_lag.step(b, a, 1.0), a),
-    "lvdt_thermal_drift": lambda n, a, b, c: (lvdt_thermal_drift.step(a, b, *n), a),
-    "linkage_backlash": lambda n, a, b, c: (linkage_backlash.step(c, n[0], abs(a)), c),
-    "linkage_compliance": lambda n, a, b, c: (linkage_compliance.step(a, b, *n), a),
-    "linkage_friction": lambda n, a, b, c: (linkage_friction.loop(a, b, n[0], c), a),
-    "linkage_wear": lambda n, a, b, c: (linkage_wear.step(c, n[0], abs(a), b), c),
-    "thermal_growth": lambda n, a, b, c: (thermal_growth.step(a, b, n[0], c), a),
-    "crank_length_error": lambda n, a, b, c: (crank_length_error.step(c, n[0]), c),
-    "link_length_error": lambda n, a, b, c: (link_length_error.step(c, n[0]), c),
-    "ring_eccentricity": lambda n, a, b, c: (ring_eccentricity.step(a, n[0], n[3]), a),
-    "pot_bias": lambda n, a, b, c: (pot_bias.step(a, n[0]), a),
-    "pot_gain": lambda n, a, b, c: (pot_gain.step(a, n[0]), a),
-    "pot_lag": lambda n, a, b, c: (pot_lag.step(c, n[0]), c),
-    "amplifier_offset": lambda n, a, b, c: (amplifier_offset.step(a, *n), a),
-    "amplifier_dead_band": lambda n, a, b, c: (amplifier_dead_band.step(a, *n), a),
-    "amplifier_lag": lambda n, a, b, c: (amplifier_lag.step(b, a, 1.0), a),
-    "tacho_thermal_drift": lambda n, a, b, c: (tacho_thermal_drift.step(a, b, *n), a),
-    "motor_torque_constant_error": lambda n, a, b, c: (motor_torque_constant_error.step(c, *n), c),
-    "screw_friction": lambda n, a, b, c: (screw_friction.step(c, *n), c),
-    "gear_backlash": lambda n, a, b, c: (gear_backlash.step(0.0, a, *n), (0.0, a)),
-    "screw_pitch_error": lambda n, a, b, c: (screw_pitch_error.step(b, a, c, *n), a),
-}
-
 
 @pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=examples(40))
@@ -282,7 +132,7 @@ def test_neutral_effect_is_an_exact_identity(name: str, a: float, b: float, c: f
     neutral = [p.neutral * p.si for p in EFFECTS[name].parameters]
     if name == "valve_flow_saturation":
         a *= 1e3  # any speed at all
-    result, expected = IDENTITIES[name](neutral, a, b, c)
+    result, expected = EXAMPLES[name].neutral(sys.modules[f"plant.effects.{name}"], neutral, a, b, c)
     assert result == expected
 
 
@@ -521,21 +371,6 @@ def test_a_block_that_leaves_out_what_its_lanes_lack_gives_the_bits_of_the_whole
     everything = {name: sizes for k in BLOCKS.values() for effects in k for name, sizes in effects.items()}
     whole, _ = actuator_lanes([*sets[:-1], everything if loads else BLOCKS["hysteresis"][0]], base, 600)
     assert np.array_equal(whole[:, :-1], x[:, :-1])
-
-
-@pytest.mark.parametrize("run, blocks, name, sizes", [
-    (actuator_lanes, hydraulic_blocks, "valve_null_bias", {"bias": -0.5}),
-    (linkage_lanes, linkage, "linkage_wear", {"vgv1": 100.0}),
-])  # fmt: skip
-def test_an_effect_that_the_blocks_do_not_call_acts_all_the_same(run, blocks, name: str, sizes, monkeypatch) -> None:
-    sets = [{name: sizes} if j % 3 == 1 else {} for j in range(40)]
-    known = run(sets, build_plant(), 600)[0]
-    monkeypatch.setattr(blocks, "CALLED", tuple(n for n in blocks.CALLED if n != name))
-    unknown = run(sets, build_plant(), 600)[0]
-    assert np.abs(known[..., 1] - known[..., 0]).max() > 1e-6 and np.allclose(unknown, known, rtol=0.0, atol=1e-12)
-    one_by_one = (actuator, "_actuator_lanes") if run is actuator_lanes else (linkage, "_linkage_lanes")
-    monkeypatch.setattr(*one_by_one, lambda *a: None)
-    assert not np.allclose(run(sets, build_plant(), 600)[0][..., 1], known[..., 1])  # it was one by one indeed
 
 
 def test_series_are_the_c_librarys_to_the_last_places() -> None:

@@ -35,7 +35,7 @@ def drawn(generator: np.random.Generator, plant: Plant, effects: int) -> Plant:
         n.name: n.value + n.tolerance * generator.uniform(-1.0, 1.0) for n in nominal(plant.table, plant.geometry)
     }
     chosen: dict[str, dict[str, float]] = {}
-    known = [e for e in EFFECTS.values() if plant.kind in e.kinds and e.name in chain_lanes.EFFECTS_CALLED]
+    known = [e for e in EFFECTS.values() if plant.kind in e.kinds and e.name not in ("can_delay", "frame_hold")]
     for e in generator.permutation(np.array(known, dtype=object))[:effects]:
         chosen[e.name] = {
             q.name: q.neutral + 0.1 * generator.uniform(0.2, 1.0) * (q.high - q.neutral)

@@ -22,56 +22,11 @@ from hil.replay import replay
 from plant import Model, Plant, build_plant
 from plant.effect import MOTOR
 from plant.effects import EFFECTS
+from tests.effect_table import EXAMPLES
 from vaneloop.base.vanes import VANES
 
 # a gross size of each effect, in declared units
-GROSS: dict[str, dict[str, float]] = {
-    "can_delay": {"delay": 0.3},
-    "frame_hold": {"period": 0.4},
-    "schedule_error": {"offset": 2.0},
-    "trend_threshold_error": {"factor": 20.0},
-    "controller_gain_error": {"factor": 2.0},
-    "rotor_lag_error": {"lag": 1.0},
-    "acceleration_limit_error": {"limit": -5.0},
-    "valve_null_bias": {"bias": 3.0},
-    "valve_dead_band": {"half_width": 3.0},
-    "valve_hysteresis": {"width": 4.0, "spread": 1.0},
-    "valve_flow_saturation": {"limit": 20.0},
-    "valve_lag": {"time_constant": 0.02},
-    "valve_gain_asymmetry": {"ratio": 1.5},
-    "supply_pressure_droop": {"droop": 150.0},
-    "oil_viscosity": {"coefficient": -0.008},
-    "piston_friction": {"force": 6000.0},
-    "piston_stiction": {"excess": 6000.0, "speed": 4.0},
-    "internal_leakage": {"coefficient": 5.0},
-    "oil_compressibility": {"compliance": 0.5},
-    "aero_load": {"force": 10000.0},
-    "end_stop_shift": {"shift": 15.0},
-    "lvdt_bias": {"bias": 1.0},
-    "lvdt_gain": {"factor": 1.1},
-    "lvdt_nonlinearity": {"amplitude": 1.0},
-    "lvdt_lag": {"time_constant": 0.02},
-    "lvdt_thermal_drift": {"coefficient": 0.02},
-    "linkage_backlash": {"vgv1": 1.0},
-    "linkage_compliance": {"compliance": 0.5},
-    "linkage_friction": {"vgv1": 1.0},
-    "linkage_wear": {"vgv1": 200.0},
-    "thermal_growth": {"vgv1": 0.05},
-    "crank_length_error": {"vgv1": 2.0},
-    "link_length_error": {"vgv1": 1.0},
-    "ring_eccentricity": {"vgv1": 0.5, "phase": 60.0},
-    "pot_bias": {"vgv1": 1.0},
-    "pot_gain": {"vgv1": 1.1},
-    "pot_lag": {"vgv1": 0.1},
-    "amplifier_offset": {"offset": 4.0},
-    "amplifier_dead_band": {"half_width": 4.0},
-    "amplifier_lag": {"time_constant": 0.03},
-    "tacho_thermal_drift": {"coefficient": -0.015},
-    "motor_torque_constant_error": {"factor": 0.2},
-    "screw_friction": {"force": 5000.0},
-    "gear_backlash": {"width": 0.4},
-    "screw_pitch_error": {"amplitude": 0.3, "phase": 30.0},
-}
+GROSS = {name: example.gross for name, example in EXAMPLES.items()}
 ELECTRIC = {name for name, e in EFFECTS.items() if e.kinds == MOTOR}
 
 

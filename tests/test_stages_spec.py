@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -14,8 +15,8 @@ from hypothesis import strategies as st
 from plant import Plant, build_plant
 from plant.chain import TICK
 from plant.curve import KNOWN, PLACES, QUANTITIES, at_curve
-from plant.effects import CURVES, EFFECTS, NEUTRAL, ROW, valve_flow_saturation
-from plant.layout import C_LOW, N_NOMINAL
+from plant.effects import CURVES, ROW, valve_flow_saturation
+from plant.layout import C_LOW
 from plant.parameters import KIND, LVDT_FACTOR, LVDT_LAG, LVDT_SHARE, VALVE_SHARE, derive
 from plant.places import LVDT_LAG_ERROR, N_R, VALVE_LAG
 from plant.stages import (
@@ -32,6 +33,7 @@ from plant.stages import (
     run_bends,
     step_currents,
 )
+from plant.stages.hydraulic_blocks import NEEDS, WAYS
 from vaneloop.base.curve import POINTS
 
 HYDRAULIC, MOTOR = "plant.toml", "plant_electromechanical.toml"
@@ -81,21 +83,11 @@ def test_the_last_part_begins_first(monkeypatch: pytest.MonkeyPatch) -> None:
     assert done == [range(4, 5), range(2, 4), range(2)]
 
 
-@pytest.mark.parametrize("sites, called", [
-    (actuator.SITES, hydraulic_blocks.CALLED), (actuator.SITES, motor_blocks.CALLED),
-    (("linkage", "pot"), linkage.CALLED), (("linkage", "pot"), ("linkage_wear",)), ((), ()),
-])  # fmt: skip
-def test_a_lane_runs_elsewhere_for_an_effect_of_the_stage_that_its_blocks_do_not_call(
-    sites: tuple[str, ...], called: tuple[str, ...]
-) -> None:
-    rows = [(N_NOMINAL + i, e) for i, e in enumerate(e for e in EFFECTS.values() for _ in e.parameters)]
-    p = np.repeat(shipped().p, len(rows) + 1, axis=1)
-    p[N_NOMINAL : N_NOMINAL + len(rows), -1] = NEUTRAL
-    for lane, (row, _) in enumerate(rows):
-        p[N_NOMINAL : N_NOMINAL + len(rows), lane] = NEUTRAL
-        p[row, lane] += 0.5
-    asked = [e.site in sites and e.name not in called for _, e in rows]
-    assert blocks.elsewhere(p, sites, called).tolist() == [*asked, False]
+@pytest.mark.parametrize("flags", list(itertools.product((False, True), repeat=len(NEEDS))))
+def test_a_block_goes_the_first_way_that_has_all_it_needs(flags: tuple[bool, ...]) -> None:
+    way = hydraulic_blocks._way.py_func(np.array(flags))
+    has = [(WAYS[k] >= flags).all() for k in range(len(WAYS))]
+    assert has[way] and not any(has[:way])
 
 
 # ---- the actuator ----------------------------------------------------------------------------------------------------
@@ -395,14 +387,11 @@ def test_rubbing_eccentric_and_bent_lanes_have_blocks_of_their_own(last: int, ca
 
 
 @pytest.mark.parametrize("n", [17, 18, 20])
-def test_a_lane_of_another_curve_or_of_an_unknown_effect_turns_its_rings_alone(
-    n: int, calls: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lane_of_another_curve_turns_its_rings_alone(n: int, calls: Any) -> None:
     wide, alone = calls(linkage, "_linkage_blocks"), calls(linkage, "_linkage_lanes")
     p = machine(n)
-    curve(p, range(1, n), "linkage.ring adds", 3)
-    put(p, 5, "linkage_wear", 1e-3)
-    monkeypatch.setattr(linkage, "CALLED", tuple(c for c in linkage.CALLED if c != "linkage_wear"))
+    curve(p, range(n), "linkage.ring adds", 3)
+    curve(p, range(5, 6), "linkage.ring adds", 5)
     run_linkage(p)
     blocks_of, one = ([q for a in seen for q in a[9].tolist()] for seen in (wide, alone))
     assert {3, 5} <= set(one) and len(one) == 2 and sorted(blocks_of + one) == list(range(n))

@@ -100,7 +100,7 @@ def _advance(
                 b.in_demand_fresh[j], b.in_demand_rejected[j] = now[S_FRESH], now[S_REJECTED]
                 if now[S_FRESH] > 0.5:
                     b.in_n_dem[j], b.in_n_r[j], b.in_mode_request[j] = b.n_dem[j], b.heard[j], now[S_MODE_REQUEST]
-            chain_lanes.feed(b, n, drive_way)
+            chain_lanes.feed(b, n)
             chain_lanes.sample_lvdt(b, n, drive_way, noise[m, 0])
             firmware_lanes.on_frame(b, n, tables)
         else:

@@ -4,38 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from plant import chain, curve, electromechanical
+from plant import chain, curve
 from plant.chain import bent_reading, measured_stroke, straightened, true_stroke
 from plant.curve_lanes import alike
-from plant.effects import CURVES, aero_load, oil_compressibility, valve_flow_saturation, valve_null_bias
-from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, KIND, LVDT_FACTOR, LVDT_LAG, LVDT_SHARE, VALVE_SHARE
-from plant.places import (
-    AERO_LOAD,
-    CURRENT,
-    GIVE,
-    INTERNAL_LEAKAGE,
-    LAGGED,
-    LVDT_LAG_ERROR,
-    OIL_COMPRESSIBILITY,
-    PISTON_STICTION,
-    READING,
-    SCREW_PITCH_ERROR,
-    SUPPLY_PRESSURE_DROOP,
-    VALVE_FLOW_SATURATION,
-    VALVE_HYSTERESIS,
-    VALVE_LAG,
-    VALVE_NULL_BIAS,
-    X_LVDT,
-    X,
-)
+from plant.effects import CURVES, aero_load
+from plant.parameters import DRIVE_EFFECTS, KIND, LVDT_FACTOR, LVDT_LAG, LVDT_SHARE, VALVE_SHARE
+from plant.places import AERO_LOAD, LVDT_LAG_ERROR, READING, SCREW_PITCH_ERROR, VALVE_LAG, X_LVDT, X
 from plant.stages import hydraulic_blocks, motor_blocks
-from plant.stages.blocks import NOTHING, W, between, elsewhere, in_blocks, on_all_cores, parts_of
+from plant.stages.blocks import NOTHING, W, between, in_blocks, on_all_cores, parts_of
 from vaneloop.base.compiled import compiled_free
 
 __all__ = ["actuator_run"]
 
 FEW = 1  # so few lanes or fewer are quicker one by one
-SITES = ("valve", "supply", "amplifier", "motor", "screw", "actuator")
 
 
 def actuator_run(
@@ -75,14 +56,10 @@ def actuator_run(
     # what one lane of a block needs is computed for all eight: those that need the same are put side by side
     motor = p[KIND, 0] != 0.0  # all lanes are of one machine
     curved = p[CURVES] != 0.0
-    alone = elsewhere(p, SITES, motor_blocks.CALLED if motor else hydraulic_blocks.CALLED)
-    alone |= curved & ~alike(p)
-    loaded, memory, sticky = (p[row] != 0.0 for row in (DRIVE_LOADED, VALVE_HYSTERESIS, PISTON_STICTION))
-    lossy = (p[SUPPLY_PRESSURE_DROOP] != 0.0) | (p[INTERNAL_LEAKAGE] != 0.0) | (p[VALVE_FLOW_SATURATION + 1] != 0.0)
-    limited = (p[VALVE_SHARE] < 1.0) | (p[LVDT_SHARE] < 1.0) | (p[VALVE_NULL_BIAS] != 0.0)
-    limited |= p[VALVE_FLOW_SATURATION] < valve_flow_saturation.OFF
+    alone = curved & ~alike(p)
     # neighbours are those that cost little more together
-    need = np.where(loaded, 4 + 8 * lossy + 2 * limited + 4 * sticky - memory, limited + 2 * memory)
+    need = np.zeros(p.shape[1]) if motor else hydraulic_blocks.costs(p)
+    needed = np.empty((0, 0)) if motor else hydraulic_blocks.needs(p)
     order = np.lexsort((need, p[SCREW_PITCH_ERROR] != 0.0, curved, alone))
     wide = in_blocks(p.shape[1] - np.count_nonzero(alone), W, FEW)
 
@@ -93,7 +70,7 @@ def actuator_run(
             motor_blocks.run(current, n_r, t_oil, dt, p, s, out.T, x, window, some, block, known)
         elif part.start < wide:
             block = np.empty(1, hydraulic_blocks.BLOCK)
-            hydraulic_blocks.run(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, block, known)
+            hydraulic_blocks.run(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, block, known, needed)
         else:
             _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, known)
 
@@ -106,12 +83,7 @@ def _rest(p: np.ndarray, s: np.ndarray, i: float, n_r: float, t_oil: float) -> N
     (degC).
     """
     for j in range(p.shape[1]):
-        current = valve_null_bias.step(i, p[VALVE_NULL_BIAS, j])
-        s[CURRENT : CURRENT + 4, j] = s[LAGGED, j] = current
-        load = aero_load.step(n_r, p[AERO_LOAD, j])
-        s[GIVE, j] = oil_compressibility.step(load, 0.0, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j])
-        if p[KIND, j] != 0.0:
-            electromechanical.rest(p, s, j, i, load, t_oil)
+        chain.rest_actuator(s, p, j, i, aero_load.step(n_r, p[AERO_LOAD, j]), t_oil)
 
 
 @compiled_free

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from plant.effects import EFFECTS, NEUTRAL, ROW
-from plant.layout import N_NOMINAL
 from vaneloop.base.compiled import inlined, threads
 from vaneloop.base.side_by_side import side_by_side
 
-__all__ = ["NOTHING", "W", "between", "elsewhere", "in_blocks", "on_all_cores", "parts_of", "put_where_seen"]
+__all__ = ["NOTHING", "W", "between", "in_blocks", "on_all_cores", "parts_of", "put_where_seen"]
 
 NOTHING = np.empty((0, 0))  # where no lane has a curve
 W = 8  # lanes in a block of the actuator: two vectors of four; more do not run faster
@@ -40,17 +38,6 @@ def on_all_cores(run: Callable[[range], None], work: list[range]) -> None:
     """``run`` all parts: compiled code needs no interpreter. The costly ones, which come last, begin first."""
     for _ in side_by_side(run, work[::-1]):
         pass
-
-
-def elsewhere(p: np.ndarray, sites: Collection[str], called: Collection[str]) -> np.ndarray:
-    """Return bool[lane]: whether the lane has an effect of these ``sites`` that is not among the ``called`` ones."""
-    rows = [
-        ROW[e.name] + i
-        for e in EFFECTS.values()
-        if e.site in sites and e.name not in called
-        for i in range(len(e.parameters))
-    ]
-    return (p[rows] != np.array([[NEUTRAL[r - N_NOMINAL]] for r in rows]).reshape(-1, 1)).any(axis=0)
 
 
 @inlined

@@ -4,40 +4,24 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from plant import chain, curve, lanes, linkage_lanes, stem
-from plant.chain import straight_reading, straightened, true_stroke
+from plant import chain, curve, lanes, linkage_lanes, lvdt, stem
+from plant.chain import straightened, true_stroke
 from plant.curve_lanes import alike, first_curved, gives, site_of, tables_of
 from plant.effects import CURVES, pot_lag
 from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank
 from plant.parameters import GEOMETRY, LVDT_LAG, POT_LAG
-from plant.places import (
-    LINKAGE_FRICTION,
-    LVDT_BIAS,
-    LVDT_GAIN,
-    LVDT_LAG_ERROR,
-    LVDT_NONLINEARITY,
-    LVDT_THERMAL_DRIFT,
-    POT,
-    POT_LAG_ERROR,
-    RING_ECCENTRICITY,
-    X,
-)
-from plant.stages.blocks import NOTHING, elsewhere, in_blocks, on_all_cores, parts_of
+from plant.places import LINKAGE_FRICTION, LVDT_LAG_ERROR, POT, POT_LAG_ERROR, RING_ECCENTRICITY, X
+from plant.stages.blocks import NOTHING, in_blocks, on_all_cores, parts_of
 from vaneloop.base.compiled import compiled_free, inlined
 
 __all__ = ["linkage_run", "speed_reach"]
 
 WIDE = 16  # lanes in a block: more are no quicker each, and fewer sets than a block's lanes fill it badly
 SOME = 1  # so few lanes or fewer are quicker one by one
-# effects that the blocks call
-CALLED = (
-    "crank_length_error", "link_length_error", "linkage_backlash", "linkage_compliance", "linkage_friction",
-    "linkage_wear", "pot_bias", "pot_gain", "pot_lag", "ring_eccentricity", "thermal_growth",
-)  # fmt: skip
 
 
 def linkage_run(
@@ -68,12 +52,12 @@ def linkage_run(
     )
     speed = (x_lvdt[ahead] - x_lvdt[behind]) / (np.maximum(ahead - behind, 1) * dt)
     curved = p[CURVES] != 0.0
-    alone = elsewhere(p, ("linkage", "pot"), CALLED) | (curved & ~alike(p))
+    alone = curved & ~alike(p)
     # what one lane of a block needs is computed for all of them: those that need the same are put side by side
     stages = range(out.shape[1])
     rubbed = (p[[LINKAGE_FRICTION + k for k in stages]] != 0.0).any(axis=0)
     eccentric = (p[[RING_ECCENTRICITY + k for k in stages]] != 0.0).any(axis=0)
-    bent = (p[LVDT_NONLINEARITY : LVDT_NONLINEARITY + 2] != 0.0).any(axis=0)
+    bent = np.array([lvdt.bends(p, j) for j in range(p.shape[1])])
     order = np.lexsort((eccentric, rubbed, bent, curved, alone))
     wide = in_blocks(p.shape[1] - np.count_nonzero(alone), WIDE, SOME)
     to = out.transpose(2, 1, 0)
@@ -146,15 +130,6 @@ def _linkage_lanes(
                 out[j, k, m] = s[POT + k, j]
 
 
-class _Lvdt(NamedTuple):
-    """What a block of lanes needs of each LVDT: by how much (s) it trails the stroke; its straight line."""
-
-    late: float
-    lvdt_gain: float
-    lvdt_drift: float
-    lvdt_bias: float
-
-
 # what curves give: to the reading, the crank, and of each stage
 _BENT = ("lvdt_adds", "lvdt_times", "crank_adds")
 _BENT_OF_STAGE = ("ring_adds", "play_adds", "pot_adds", "pot_times")
@@ -166,10 +141,13 @@ _OF_STAGE = (
 @lru_cache
 def _linkage(stages: int) -> np.dtype[np.void]:
     """Block for that many stages: the compiler knows how often its loops over them go."""
-    return lanes.block(WIDE, linkage_lanes.Crank, _Lvdt, more=("stroke", "c", "d", *_BENT), each=(stages, *_OF_STAGE))
+    # late: s, by which the LVDT trails the stroke
+    more = ("late", "stroke", "c", "d", *_BENT)
+    return lanes.block(WIDE, linkage_lanes.Crank, lvdt.Lvdt, more=more, each=(stages, *_OF_STAGE))
 
 
 _crank, _put_crank = lanes.getter(linkage_lanes.Crank), lanes.putter(linkage_lanes.Crank)
+_lvdt, _put_lvdt = lanes.getter(lvdt.Lvdt), lanes.putter(lvdt.Lvdt)
 _stem, _put_stem = lanes.getter(stem.Stem, "k"), lanes.putter(stem.Stem, "k")
 _stem_state, _put_stem_state = lanes.getter(stem.StemState, "k"), lanes.putter(stem.StemState, "k")
 
@@ -201,8 +179,8 @@ def _linkage_blocks(
                 b, j, linkage_lanes.crank_numbers(p[g + G_LX0, q], p[g + G_X1, q], p[g + G_Y1, q], p[g + G_LE, q])
             )
             b.late[j] = max(p[LVDT_LAG, q], 0.0) + p[LVDT_LAG_ERROR, q]
-            b.lvdt_gain[j], b.lvdt_drift[j], b.lvdt_bias[j] = p[LVDT_GAIN, q], p[LVDT_THERMAL_DRIFT, q], p[LVDT_BIAS, q]
-            bent |= p[LVDT_NONLINEARITY, q] != 0.0 or p[LVDT_NONLINEARITY + 1, q] != 0.0
+            _put_lvdt(b, j, lvdt.prepare(p, q))
+            bent |= lvdt.bends(p, q)
             for k in range(b.pot.shape[0]):
                 d = stem.prepare(p, q, k)
                 _put_stem(b, k, j, d)
@@ -210,8 +188,8 @@ def _linkage_blocks(
                 b.pot[k, j], b.lever[k, j] = s[POT + k, q], d.ldp / d.length
                 b.span[k, j], b.half[k, j] = linkage_lanes.ring_numbers(d.lc, d.ld)
                 b.e[k, j], b.b[k, j] = _ramp_lag(pot_lag.step(p[POT_LAG, q], p[POT_LAG_ERROR + k, q]), dt)
-                rubbed |= d.friction != 0.0
-                eccentric |= d.amplitude != 0.0
+                rubbed |= d.linkage_friction != 0.0
+                eccentric |= d.ring_eccentricity != 0.0
         some = order[j0 : j0 + last]
         first = first_curved(p, some)
         tables = tables_of(p, max(first, 0), some, WIDE)
@@ -227,8 +205,7 @@ def _linkage_blocks(
                     b.stroke[j] = true_stroke(seen, p, q, t_oil[m])
             else:
                 for j in range(WIDE):
-                    off = straight_reading(0.0, b.lvdt_gain[j], b.lvdt_drift[j], b.lvdt_bias[j], t_oil[m])
-                    b.stroke[j] = (x_lvdt[m] + b.late[j] * speed[m] - off) / b.lvdt_gain[j]
+                    b.stroke[j] = lvdt.straightened(_lvdt(b, j), x_lvdt[m] + b.late[j] * speed[m], t_oil[m])
             if first >= 0:
                 for j in range(WIDE):
                     b.c[j], b.d[j] = linkage_lanes.crank(b.stroke[j] + b.crank_adds[j], _crank(b, j))
@@ -242,10 +219,10 @@ def _linkage_blocks(
                     )
                 if eccentric:
                     for j in range(WIDE):
-                        b.theta[k, j] = stem.drive(_stem(b, k, j), b.theta[k, j], n_r[m], t_oil[m], True)
+                        b.theta[k, j] = stem.drive(_stem(b, k, j), b.theta[k, j], n_r[m], t_oil[m], t[m], True)
                 else:
                     for j in range(WIDE):
-                        b.theta[k, j] = stem.drive(_stem(b, k, j), b.theta[k, j], n_r[m], t_oil[m], False)
+                        b.theta[k, j] = stem.drive(_stem(b, k, j), b.theta[k, j], n_r[m], t_oil[m], t[m], False)
                 if first >= 0:
                     for j in range(WIDE):
                         b.theta[k, j] += b.ring_adds[k, j]
@@ -258,9 +235,9 @@ def _linkage_blocks(
                 else:
                     _follow(b, k, t_oil[m], t[m], False, False)
                 if first >= 0:
-                    _read(b, k, m, True)
+                    _read(b, k, m, t_oil[m], t[m], True)
                 else:
-                    _read(b, k, m, False)
+                    _read(b, k, m, t_oil[m], t[m], False)
                 for j in range(last):
                     out[order[j0 + j], k, m] = b.pot[k, j]
         for j in range(last):
@@ -281,10 +258,10 @@ def _follow(b: Any, k: int, t_oil: float, t: float, rubbed: bool, curved: bool) 
 
 
 @inlined
-def _read(b: Any, k: int, m: int, curved: bool) -> None:
+def _read(b: Any, k: int, m: int, t_oil: float, t: float, curved: bool) -> None:
     """Let the potentiometers of stage ``k`` follow their vanes at sample ``m``."""
     for j in range(WIDE):
-        vane = stem.reading(_stem(b, k, j), linkage_lanes.vane_angle(b.theta[k, j], b.lever[k, j]))
+        vane = stem.reading(_stem(b, k, j), linkage_lanes.vane_angle(b.theta[k, j], b.lever[k, j]), t_oil, t)
         if curved:
             vane = curve.bent(vane, b.pot_times[k, j], b.pot_adds[k, j])
         before = vane if m == 0 else b.before[k, j]

@@ -9,23 +9,17 @@ import numpy as np
 from plant import curve, electromechanical, lanes
 from plant.chain import measured_stroke, true_stroke
 from plant.curve_lanes import first_curved, tables_of
-from plant.effects import aero_load
 from plant.parameters import motor_steps
-from plant.places import AERO_LOAD, SCREW_PITCH_ERROR, TACHO_THERMAL_DRIFT
+from plant.places import SCREW_PITCH_ERROR
 from plant.stages.bends import BENT, bend_drive, bend_reading
 from plant.stages.blocks import W, between, put_where_seen
 from vaneloop.base.compiled import compiled_free, inlined
 
-__all__ = ["BLOCK", "CALLED", "run"]
+__all__ = ["BLOCK", "run"]
 
-# effects that the blocks call; those of the LVDT are in `measured_stroke`, which both forms share
-CALLED = (
-    "aero_load", "amplifier_dead_band", "amplifier_lag", "amplifier_offset", "end_stop_shift", "gear_backlash",
-    "motor_torque_constant_error", "screw_friction", "screw_pitch_error", "tacho_thermal_drift",
-)  # fmt: skip
 BLOCK = lanes.block(
     W, electromechanical.MotorState, electromechanical.Motor,
-    more=("aero", "i_cmd", "torque_of_load", "most", "logged", *BENT),
+    more=("i_cmd", "torque_of_load", "most", "logged", *BENT),
 )  # fmt: skip
 _motor_state, _put_motor_state = (
     lanes.getter(electromechanical.MotorState),
@@ -58,12 +52,10 @@ def run(
     b = block[0]
     for j0 in range(0, len(order), W):
         last = min(W, len(order) - j0)
-        swaying = drifting = False
+        swaying, prepared_at = False, t_oil[0]
         for j in range(W):
             q = order[j0 + min(j, last - 1)]
             swaying |= p[SCREW_PITCH_ERROR, q] != 0.0
-            drifting |= p[TACHO_THERMAL_DRIFT, q] != 0.0
-            b.aero[j] = p[AERO_LOAD, q]
             _put_motor_state(b, j, electromechanical.taken(s, q))
             _put_motor(b, j, electromechanical.prepare(p, q, t_oil[0]))
         some = order[j0 : j0 + last]
@@ -72,11 +64,12 @@ def run(
         for k in range(n):
             if k > 0:
                 speed, warm = between(n_r, k), between(t_oil, k)
-                if drifting:
-                    for j in range(last):
-                        _put_motor(b, j, electromechanical.prepare(p, order[j0 + j], warm))
+                if warm != prepared_at:
+                    prepared_at = warm
+                    for j in range(W):
+                        _put_motor(b, j, electromechanical.prepare(p, order[j0 + min(j, last - 1)], warm))
                 for j in range(W):
-                    force = aero_load.step(speed, b.aero[j])
+                    force = electromechanical.load_of(_motor(b, j), speed)
                     b.torque_of_load[j], b.most[j] = electromechanical.load_torques(_motor(b, j), force)
                 for m in range(substeps):
                     for j in range(W):
@@ -85,7 +78,7 @@ def run(
                         bend_drive(b, p, first, known, k, current[k, m], tables, some)
                         for j in range(W):
                             b.i_cmd[j] += b.current_adds[j]
-                            force = aero_load.step(speed, b.aero[j]) + b.load_adds[j]
+                            force = electromechanical.load_of(_motor(b, j), speed) + b.load_adds[j]
                             b.torque_of_load[j], b.most[j] = electromechanical.load_torques(_motor(b, j), force)
                     if swaying:
                         _substep(b, many, h, True)
