@@ -16,6 +16,7 @@ from hil.logs.plausible import LONGEST
 from hil.loop.lockstep import Stimulus, lockstep
 from hil.replay import ReplayResult
 from plant import Plant, build_plant
+from plant.parameters import PLAY
 from vaneloop.base.tables import Axis, Bound, Bounded, Quantity, read
 
 __all__ = ["RASTER", "EngineTestTable", "engine_test", "load_profile"]
@@ -80,8 +81,6 @@ def engine_test(
     """
     machine = plant or build_plant()
     if hysteresis is not None:
-        from plant.parameters import PLAY
-
         p = machine.p.copy()
         width = machine.geometry.vigv
         p[PLAY, 0] = np.deg2rad(hysteresis) * width.l.value / width.ld_prime.value

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
@@ -17,10 +17,7 @@ from plant.linkage import G_L, G_LDP, N_CRANK, N_PER_STAGE
 from plant.parameters import GEOMETRY, AnyPlantTable, Nominal, Supply, derive, load_plant, nominal
 from vaneloop.base.vanes import own_rows, same_stages
 
-if TYPE_CHECKING:
-    from plant.model import Model
-
-__all__ = ["Plant", "build_plant"]
+__all__ = ["Additions", "Plant", "build_plant"]
 
 
 @dataclass(frozen=True)
@@ -99,11 +96,18 @@ class Plant:
         return float(self.p[o + G_LDP, 0]), float(self.p[o + G_L, 0])
 
 
+class Additions(Protocol):
+    """What a machine has beyond its tables, as a `plant.model.Model` says."""
+
+    def plant(self, base: Plant | None = None) -> Plant:
+        """Return ``base`` with it."""
+
+
 def build_plant(
     source: str | Path = "plant.toml",
     geometry: str | Path = "geometry.toml",
     schedules: str | Path = "schedules.toml",
-    model: Model | None = None,
+    model: Additions | None = None,
 ) -> Plant:
     """Read the plant's tables and return the machine they describe, with what ``model`` adds. InputError for what
     cannot be used.

@@ -21,7 +21,7 @@ from collections.abc import Callable
 from typing import Any
 
 from hil.inject.__main__ import main as inject_main
-from hil.replay import main as replay_main
+from hil.replay.__main__ import main as replay_main
 from tests.conftest import ROOT
 from vaneloop.cli.main import COMMANDS, main
 

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import hil.bus
-from hil.bus import local_bus, lockstep_bus, port
+from hil.bus import port
 from hil.bus.port import Port, open_bus
 from vaneloop.base.errors import InputError
 
@@ -41,8 +41,8 @@ class Buses:
         self.monkeypatch = monkeypatch
         from can.interfaces import socketcan
 
-        monkeypatch.setattr(local_bus, "LocalBus", self.kind("local"))
-        monkeypatch.setattr(lockstep_bus, "LockstepBus", self.kind("lockstep"))
+        monkeypatch.setattr(port, "LocalBus", self.kind("local"))
+        monkeypatch.setattr(port, "LockstepBus", self.kind("lockstep"))
         monkeypatch.setattr(socketcan, "SocketcanBus", self.kind("socketcan"))
         monkeypatch.setattr(port, "_NET", net)
         monkeypatch.setattr(port, "socket", SimpleNamespace(**{**vars(socket), "socket": self.socket}))
@@ -170,7 +170,7 @@ def test_a_bus_that_does_not_open_is_one_line_with_the_way_out(buses: Buses, err
     def refuses(*_: Any, **__: Any) -> Any:
         raise error
 
-    buses.monkeypatch.setattr(local_bus, "LocalBus", refuses)
+    buses.monkeypatch.setattr(port, "LocalBus", refuses)
     with pytest.raises(InputError) as e:
         open_bus("local:rig")
     assert str(e.value) == f"--bus local:rig: {says}; {INSTEAD}"

@@ -392,7 +392,7 @@ def test_a_compiled_function_is_what_its_c_computes(gcc: str, tmp_path: Path, mo
         if what > 1:
             m[0] = m[what] / (ticks - 2) + math.floor(m[1])  # a division by zero is infinite, no error
 
-    monkeypatch.setattr(kernel, "entry", lambda part, shape: serve)
+    monkeypatch.setattr(source, "entry", lambda part, shape: serve)
     (tmp_path / "f.c").write_text(source._translated("plant", Shape(1, 2, 3)))
     subprocess.run([gcc, "-std=c99", "-fPIC", "-shared", "-o", "f.so", "f.c", "-lm"], cwd=tmp_path, check=True)
     m, made = np.array([1.5, -2.75, -3.25, 8.0]), ctypes.CDLL(str(tmp_path / "f.so")).serve

@@ -19,7 +19,6 @@ from hil import replay as replay_module
 from hil.engine_test import EngineTestTable, engine_test, load_profile
 from hil.figures import error_figures, noise_floor, resolution, resolution_before
 from hil.logs import Channel, Log, LogError
-from hil.loop import lockstep as lockstep_module
 from hil.loop.lockstep import Run, Stimulus
 from hil.replay import replay, replay_json
 from plant import build_plant
@@ -317,9 +316,9 @@ def log_of(end: float = 2.0, raster: float = 0.01, **channels: Channel) -> Log:
 def loop(monkeypatch: pytest.MonkeyPatch) -> Loop:
     """The loop of a replay of two seconds."""
     stand_in = Loop(np.arange(201) * 0.01)
-    monkeypatch.setattr(lockstep_module, "lockstep", stand_in)
-    monkeypatch.setattr("plant.build_plant", lambda: SHIPPED)
-    monkeypatch.setattr("controller.load_calibration", flashed)
+    monkeypatch.setattr(replay_module, "lockstep", stand_in)
+    monkeypatch.setattr(replay_module, "build_plant", lambda: SHIPPED)
+    monkeypatch.setattr(replay_module, "load_calibration", flashed)
     return stand_in
 
 
@@ -425,7 +424,7 @@ def test_signals_are_held_against_the_log_at_its_times_and_against_the_schedule(
 
 def test_a_motor_s_current_is_among_the_curves(monkeypatch: pytest.MonkeyPatch) -> None:
     t = np.arange(201) * 0.01
-    monkeypatch.setattr(lockstep_module, "lockstep", Loop(t, i_motor=2.0 * t))
+    monkeypatch.setattr(replay_module, "lockstep", Loop(t, i_motor=2.0 * t))
     assert replay(log_of()).model["i_motor"] == pytest.approx(2.0 * t)
 
 

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from controller import FAULTS, MODES, load_calibration
 from hil import inject, native
-from hil.bus import port, wire
+from hil.bus import wire
 from hil.bus.frames import EXTENDED, REMOTE
 from hil.bus.lockstep_bus import run_lockstep
 from hil.inject import Check, Expect, Outcome, Scenario, Trace, injection, judge, sil
@@ -1644,8 +1644,8 @@ class Live:
 
 def on_bus(live: Live, monkeypatch: pytest.MonkeyPatch, *actions: Any, duration: float = 0.5, **keys: Any) -> Outcome:
     """Play a scenario on it."""
-    monkeypatch.setattr(port, "open_bus", lambda name: live)
-    monkeypatch.setattr(port, "Port", lambda opened: opened)
+    monkeypatch.setattr(injection, "open_bus", lambda name: live)
+    monkeypatch.setattr(injection, "Port", lambda opened: opened)
     monkeypatch.setattr(injection, "time", live)
     scenario = Scenario(title="made", duration=duration, inject=list(actions), expect=keys.pop("expect", []))
     return inject.run(scenario, bus="vcan9", **keys)

@@ -45,7 +45,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 }
 # Doors that stand in a lower room: what else these files may import.
 DOORS: dict[str, tuple[str, ...]] = {
-    "hil/replay.py": ("vaneloop.cli.replay",),  # python -m hil.replay
+    "hil/replay/__main__.py": ("vaneloop.cli.replay",),  # python -m hil.replay
     "hil/inject/__main__.py": ("vaneloop.cli.inject",),  # python -m hil.inject
     # what a user describes is offered at the room's door
     "vaneloop/identification/__init__.py": (
@@ -94,6 +94,7 @@ EXPORTS: dict[str, list[str]] = {
         *("judge", "library", "load_scenario", "run"),
     ],
     "hil.fmu": ["is_made", "write_fmu"],
+    "hil.replay": ["ReplayResult", "replay", "replay_json"],
     "hil.native": ["Program"],
     "hil.uds": ["Server", "TroubleMemory"],
     "hil.logs": [
@@ -267,8 +268,8 @@ def test_imports_run_the_way_the_architecture_says(home: str) -> None:
         ("hil/x.py", "from plant import chain\nfrom controller import tick", None),
         ("hil/x.py", "if True:\n    import tests.rig", "tests.rig"),
         ("hil/logs/x.py", "from vaneloop.cli import replay", "vaneloop.cli"),
-        ("hil/replay.py", "from vaneloop.cli import replay", None),
-        ("hil/replay.py", "from vaneloop.cli import compare", "vaneloop.cli.compare"),
+        ("hil/replay/__main__.py", "from vaneloop.cli import replay", None),
+        ("hil/replay/__main__.py", "from vaneloop.cli import compare", "vaneloop.cli.compare"),
         ("vaneloop/identification/regimes.py", "import hil.logs", "hil.logs"),
         ("vaneloop/identification/regimes.py", "from vaneloop.base.errors import InputError", None),
         (

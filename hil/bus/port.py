@@ -5,15 +5,16 @@ from __future__ import annotations
 import re
 import socket
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import can
 import numpy as np
+from can.interfaces import socketcan
 
 from hil.bus.frames import FD, HEAD_MASK, to_bytes
+from hil.bus.local_bus import DEFAULT, LocalBus
+from hil.bus.lockstep_bus import LockstepBus
 from vaneloop.base.errors import InputError
-
-if TYPE_CHECKING:
-    import can
 
 __all__ = ["BUS_HELP", "Port", "open_bus"]
 
@@ -32,23 +33,15 @@ def open_bus(name: str, **options: Any) -> can.BusABC:
     options go to the python-can interface (``receive_own_messages``, ``can_filters``, ...). InputError where there is
     no such bus.
     """
-    import can
-
     kind, _, rest = name.partition(":")
     try:
         if kind == "local":
-            from hil.bus.local_bus import DEFAULT, LocalBus
-
             return LocalBus(rest or DEFAULT, **options)
         if kind == "lockstep":
-            from hil.bus.lockstep_bus import LockstepBus
-
             return LockstepBus(rest or "lockstep", **options)
         if not rest and (re.fullmatch(r"v?can\d+", kind) or _is_can(kind)):
             _check_socketcan(kind)
-            from can.interfaces.socketcan import SocketcanBus
-
-            return SocketcanBus(kind, **{"fd": True, **options})
+            return socketcan.SocketcanBus(kind, **{"fd": True, **options})
     except (OSError, can.CanError) as e:
         raise InputError(
             f"--bus {name}: {getattr(e, 'strerror', None) or e}; --bus local joins the embedded bus instead"

@@ -6,6 +6,7 @@ tick of 1 ms. FMPy loads the FMU.
 
 from __future__ import annotations
 
+import importlib
 import math
 import platform
 import shutil
@@ -23,7 +24,7 @@ from hil.loop.node import Node
 from plant import Plant, chain, places
 from plant.parameters import LVDT_STEP
 from vaneloop.base.errors import InputError, meant
-from vaneloop.base.extras import needs
+from vaneloop.base.extras import needed
 
 __all__ = ["INPUTS", "OUTPUTS", "PlantFmu", "PlantNode"]
 
@@ -163,12 +164,9 @@ class PlantNode(Node):
 
 
 def _fmpy(path: str) -> Any:
-    needs(f"--plant {path}: an FMU", "fmpy")
-    import fmpy
-    import fmpy.fmi1
-    import fmpy.fmi2
-    import fmpy.fmi3
-
+    fmpy = needed(f"--plant {path}: an FMU", "fmpy")
+    for version in ("fmi1", "fmi2", "fmi3"):
+        importlib.import_module(f"fmpy.{version}")
     return fmpy
 
 

@@ -24,6 +24,8 @@ import numba
 import numpy as np
 
 from hil.fmu.description import OPTIONS
+from hil.fmu.ir_to_c import translate
+from hil.fmu.kernel import entry
 from hil.fmu.memory import Shape, places_of
 from hil.fmu.variables import Variable
 from hil.loop.lockstep import WARM_UP
@@ -110,9 +112,6 @@ def build(words: Sequence[str], out: str, folder: Path) -> None:
 
 
 def _translated(part: str, shape: Shape) -> str:
-    from hil.fmu.ir_to_c import translate
-    from hil.fmu.kernel import entry
-
     compiler: Any = numba
     types = compiler.types
     signature = types.void(types.CPointer(types.float64), types.int64, types.int64)

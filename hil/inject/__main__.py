@@ -1,5 +1,6 @@
 """``python -m hil.inject``: the same command as ``vaneloop inject``."""
 
+import importlib
 import sys
 
 from vaneloop.base import terminal
@@ -7,13 +8,7 @@ from vaneloop.base import terminal
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line; return the exit code."""
-
-    def load() -> object:
-        from vaneloop.cli import inject
-
-        return inject
-
-    return terminal.start("python -m hil.inject", load, argv)
+    return terminal.start("python -m hil.inject", lambda: importlib.import_module("vaneloop.cli.inject"), argv)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from hil.bus import frames
-from vaneloop.base.tables import Table
+from hil.logs.dbc import load_dbc
+from plant.effects import EFFECTS
+from vaneloop.base.tables import Table, path
 
 __all__ = [
     "ACTIONS",
@@ -55,9 +57,6 @@ IDENTIFIERS = {name: ident for ident, name in (frames.NAMES | frames.AUTH_NAMES)
 @lru_cache(maxsize=1)
 def layouts() -> dict[str, Any]:
     """Return the messages of ``vgv.dbc`` by name."""
-    from hil.logs.dbc import load_dbc
-    from vaneloop.base.tables import path
-
     return {m.layout.name: m for m in load_dbc(path("vgv.dbc"))[0]}
 
 
@@ -359,8 +358,6 @@ class Machine(Action):
             if self.parameters:
                 raise ValueError("parameters need an effect")
             return self
-        from plant.effects import EFFECTS
-
         if self.effect not in EFFECTS:
             raise ValueError(f"effect (={self.effect!r}) must be one of {', '.join(EFFECTS)}")
         known = {q.name: q for q in EFFECTS[self.effect].parameters}

@@ -27,6 +27,9 @@ from hil.calibrate.slave import Slave, key_of
 from hil.calibrate.station import MASTER, MOST_WAITING, MOST_WORK, Attended, XcpService, data_of, row_of
 from hil.inject.tool_rules import Tool, in_frames, rules_of
 from hil.loop.node import Ecu, Node
+from hil.uds.server import Server
+from hil.uds.server import key_of as uds_key
+from hil.uds.station import FUNCTIONAL, REQUEST, UdsService
 
 __all__ = ["ToolCampaign", "fuzz_tools"]
 
@@ -77,9 +80,6 @@ class _Target:
             self.slave = Slave(self.memory, seed=seed, locked=locked)
             self.services.append(XcpService(self.slave))
         if protocol != "xcp":
-            from hil.uds.server import Server
-            from hil.uds.station import UdsService
-
             self.server = Server(self.memory, seed=seed)
             self.services.append(UdsService(self.server))
         self.service = self.services[0]
@@ -178,9 +178,6 @@ def _xcp(rng: np.random.Generator, target: _Target, last: bytes) -> list[tuple[i
 
 
 def _uds(rng: np.random.Generator, target: _Target, last: bytes) -> list[tuple[int, bytes]]:
-    from hil.uds.server import key_of as uds_key
-    from hil.uds.station import FUNCTIONAL, REQUEST
-
     ident = REQUEST if rng.random() < 0.9 else FUNCTIONAL
     raw = bytearray(rng.integers(0, 256, rng.integers(1, 8), dtype=np.uint8).tobytes())
     kind = rng.integers(0, 10)
@@ -204,8 +201,6 @@ def _uds(rng: np.random.Generator, target: _Target, last: bytes) -> list[tuple[i
 
 
 def _both(rng: np.random.Generator, target: _Target, last: bytes) -> list[tuple[int, bytes]]:
-    from hil.uds.server import key_of as uds_key
-
     if not rng.integers(0, 60):  # the ECU asks for RUN or not, or is not there for a while
         target.ecu.set_demand(70.0, mode_request=int(rng.integers(0, 2)))
         target.away = int(rng.choice([0, 0, 0, 30, 1200]))

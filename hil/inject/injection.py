@@ -26,9 +26,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from controller import MODES
+from controller import MODES, load_calibration
 from hil.bus import frames
+from hil.bus import wire as w
+from hil.bus.lockstep_bus import Channel
+from hil.bus.port import Port, open_bus
 from hil.bus.secoc import Authenticator
+from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
 from hil.inject.actions import (
     ACTIONS,
     Action,
@@ -55,14 +59,18 @@ from hil.inject.any_controller import Reactions, expected_of_any
 from hil.inject.scenario import COUNTS, Expect, Scenario, library, load_scenario
 from hil.inject.tamper import Gateway, Intruder, tick_of
 from hil.inject.verdict import TRANSITIONS, Check, Outcome, Trace, failed, judge, outcome_of
+from hil.loop.node import Ecu, Node
+from hil.loop.secured import DEMANDED, FROM_CONTROLLER, Secured
 from hil.native.isolation import ControllerFailed, isolated
+from plant import build_plant, chain, places
+from plant.effects import EFFECTS
+from plant.parameters import derive
 from vaneloop.base.errors import InputError
 from vaneloop.base.extras import is_there
 from vaneloop.base.vanes import VANES
 
 if TYPE_CHECKING:
     from controller import Calibration
-    from hil.loop.node import Ecu, Node
     from plant import Plant
 
 __all__ = [
@@ -110,9 +118,6 @@ class MachineChange:
             self._set(*self.old)
 
     def _set(self, rows: dict[int, float], supply: dict[int, float]) -> None:
-        from plant import chain
-        from plant.parameters import derive
-
         for i, v in supply.items():
             self.fed[i] = v
         if rows:
@@ -134,8 +139,6 @@ class Disturber:
 
     def tick(self, k: int) -> None:
         """Set the wire's state for tick ``k``."""
-        from hil.bus import wire as w
-
         if self.errors:
             well = 1.0
             for first, end, probability in self.errors:
@@ -155,8 +158,6 @@ class Disturber:
         """Return what ``times`` occurrences of 11 recessive bits from now on are for the wire, which counts from where
         it became free.
         """
-        from hil.bus import wire as w
-
         idle = max(int(self.wire.clock[w.NOW] - self.wire.clock[w.FREE]), 0)
         return times + -(-idle // w.RECESSIVE)
 
@@ -195,8 +196,6 @@ def _keys(scenario: Scenario) -> tuple[Authenticator, Authenticator] | None:
 
 def _secured(node: Node, ecu: Ecu, authenticator: Authenticator) -> tuple[Any, Any]:
     """Both nodes with authentication; the freshness value of a tick is its number."""
-    from hil.loop.secured import DEMANDED, FROM_CONTROLLER, Secured
-
     both = Secured(node, authenticator, DEMANDED), Secured(ecu, authenticator, FROM_CONTROLLER)
     for one in both:
         one.gate.correct(0, 0)
@@ -212,11 +211,6 @@ def _lockstep(
     reactions: Reactions | None,
 ) -> Outcome:
     """Run a scenario in simulated time."""
-    from hil.bus.lockstep_bus import Channel
-    from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
-    from hil.loop.node import Ecu, Node
-    from plant import build_plant, places
-
     plant = plant or build_plant()
     if why := lacks(scenario, plant):
         raise InputError(f"{name}: {why}")
@@ -334,8 +328,6 @@ class _Witness:
 
     def trace(self, begin: float) -> Trace:
         """Return the samples from ``begin`` s on, with times from there."""
-        from controller import load_calibration
-
         table = np.array(self.rows)
         table = table[table[:, 0] >= begin]
         cal = load_calibration().scalars
@@ -365,8 +357,6 @@ def lacks(scenario: Scenario, plant: Plant) -> str:
     """Return what the scenario does to an actuator that this machine does not have, or with a package that is not
     installed; empty if there is no such thing.
     """
-    from plant.effects import EFFECTS
-
     if scenario.secoc and not is_there("cryptography"):
         return "secoc: authentication needs cryptography, which is not installed: pip install 'vaneloop[secoc]'"
     for a in scenario.inject:
@@ -380,8 +370,6 @@ def lacks(scenario: Scenario, plant: Plant) -> str:
 
 def _on_bus(name: str, scenario: Scenario, bus: str, progress: Callable[[float], None] | None) -> Outcome:
     """Play a scenario in real time on a bus on which a controller and an ECU run."""
-    from hil.bus.port import Port, open_bus
-
     why = cannot(scenario)
     if why:
         raise InputError(f"{name} on {bus}: {why}")

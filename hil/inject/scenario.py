@@ -7,6 +7,7 @@ power-on of controller and ECU. Nothing here runs anything: `hil.inject` does.
 
 from __future__ import annotations
 
+import difflib
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
@@ -196,8 +197,6 @@ def load_scenario(source: str | Path) -> Scenario:
     if isinstance(source, str) and source in known:
         return read(known[source], Scenario)
     if not Path(source).is_file():
-        import difflib
-
         close = difflib.get_close_matches(str(source), known, 1)
         hint = f"; {close[0]!r} ships" if close else "; vaneloop inject --list shows those that ship"
         raise InputError(f"{source}: no such file or shipped scenario{hint}")

@@ -22,6 +22,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from hil import inject
+
 if TYPE_CHECKING:
     from hil.inject import Outcome
     from hil.inject.actions import AnyAction
@@ -40,8 +42,6 @@ class Sil:
 
     def __getattr__(self, name: str) -> Any:
         """Give an action or `Expect` by its name in `hil.inject`."""
-        from hil.inject import injection as inject
-
         if name in ("Expect", "Scenario", *(c.__name__ for c in inject.ACTIONS.values())):
             return getattr(inject, name)
         raise AttributeError(
@@ -57,8 +57,6 @@ class Sil:
         changes   keys of the scenario to replace, for example ``seed=7``
         """
         __tracebackhide__ = True
-        from hil.inject import injection as inject
-
         if not isinstance(scenario, inject.Scenario):
             beside = self.folder / scenario
             source = beside if beside.is_file() else scenario
@@ -88,8 +86,6 @@ class Sil:
         as a call does.
         """
         __tracebackhide__ = True
-        from hil.inject import injection as inject
-
         return self(
             inject.Scenario(
                 title="scenario of a test", inject=list(actions), expect=expect or [], duration=duration, **keys

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from hil.bus.frames import R_LAST, R_LAST_TICK
+from hil.logs import read_log
 from hil.logs.held import held
 from hil.logs.plausible import LONGEST
 from hil.loop.node import Ecu
@@ -117,8 +118,6 @@ def read_profile(path: str | Path, tell: Callable[[list[str]], None] | None = No
                 f"{path}: t has {len(columns['t'])} numbers, n_dem {len(columns['n_dem'])}; they must be as many"
             )
         return _checked(Demand(columns["t"], columns["n_dem"]), path)
-    from hil.logs import read_log
-
     log = read_log(path, **options)
     if tell is not None:
         tell(log.notes)

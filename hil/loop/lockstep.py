@@ -25,7 +25,7 @@ from controller import STATE, Calibration, load_calibration
 from controller.records import SLOW, as_inputs, as_outputs
 from hil.loop.tick import FRAME, Loop, control, hear, mean_current, move, new_loop
 from plant import Plant, build_plant, chain, places
-from vaneloop.base.compiled import compiled_free
+from vaneloop.base.compiled import compiled_free, is_cached
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES, own_rows
 
@@ -280,8 +280,6 @@ def warm_up(say: Callable[[str], None]) -> None:
     """Compile the loop once, telling the user before a wait of some seconds; silent when its compiled code is there
     already.
     """
-    from vaneloop.base.compiled import is_cached
-
     if is_cached(advance):
         return
     say("compiling the simulator for this machine (once, about 15 s) ...")

@@ -37,6 +37,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
+from can import CanError
 
 from hil.bus.frames import HEAD_MASK, NOTE, PAUSE
 
@@ -366,8 +367,6 @@ def run_realtime(
 
     Call it inside `undisturbed`. The frames that the node still has to get are those that came until its last tick.
     """
-    from can import CanError
-
     ticker = ticker or Ticker()
     stop = Stop() if stop is None else stop  # one that nobody has asked yet is false
     rows = np.zeros((MOST_READ + MOST_NOTES, 2), np.int64)

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
+from pyarrow import parquet
 
 from controller import INPUTS, Calibration, new_outputs, new_state
 from hil.logs.parquet_format import whole_parquet
@@ -29,9 +31,6 @@ _KEY = b"vaneloop.controller_crash"
 
 def write(path: str, box: Box, line: str) -> str:
     """Write the inputs of ``box``; return what came of it, in words."""
-    import pyarrow as pa
-    from pyarrow import parquet
-
     if len(box.inputs) <= box.tick:
         return f"no crash log: it ran for more ticks ({box.tick + 1:,}) than are kept"
     about = {"tick": box.tick, "controller": box.controller, "failure": line, "calibration": box.calibration}
@@ -47,8 +46,6 @@ def write(path: str, box: Box, line: str) -> str:
 
 def is_crash_log(path: str | Path) -> bool:
     """Whether the file is one that `write` wrote."""
-    from pyarrow import parquet
-
     try:
         return Path(path).suffix == ".parquet" and _KEY in (parquet.read_schema(path).metadata or {})
     except (OSError, ValueError):

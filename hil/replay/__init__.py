@@ -8,16 +8,22 @@ measured; vane angles also against the schedule's target at the measured speed, 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from controller import load_calibration
+from hil.figures import error_figures
+from hil.logs import LogError
+from hil.logs.held import ANSWERS, COMMANDS, answers, held, phase_of_ticks, taken
+from hil.loop.lockstep import FRAME, Stimulus, lockstep
+from plant import build_plant
+from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from hil.figures import SignalError
     from hil.logs import Channel, Log
 
@@ -63,16 +69,6 @@ def replay(
 
     Raises LogError for a log that cannot drive the loop.
     """
-    import numpy as np
-
-    from controller import load_calibration
-    from hil.figures import error_figures
-    from hil.logs import LogError
-    from hil.logs.held import ANSWERS, COMMANDS, answers, held, phase_of_ticks, taken
-    from hil.loop.lockstep import FRAME, Stimulus, lockstep
-    from plant import build_plant
-    from vaneloop.base.signals import UNITS
-
     machine = plant or build_plant()
     cal = calibration or load_calibration(strategy=strategy)
     demand = log.channels["n_dem"]
@@ -165,10 +161,6 @@ def replay(
 
 def _when_had(c: Channel, ticks: np.ndarray, had: np.ndarray) -> Channel:
     """A command in frames, each at the first of the ``ticks`` that had it; ``had`` as of `hil.logs.held.taken`."""
-    import numpy as np
-
-    from hil.logs.held import held
-
     row = held(c, had)
     new = np.flatnonzero(np.diff(row, prepend=-1))
     return replace(c, t=ticks[new], values=c.values[row[new]])
@@ -176,15 +168,11 @@ def _when_had(c: Channel, ticks: np.ndarray, had: np.ndarray) -> Channel:
 
 def _in_tick(when: np.ndarray, t: np.ndarray) -> np.ndarray:
     """The nearest of the simulated times ``t``: what the controller sent is that of its tick, when the bus was free."""
-    import numpy as np
-
     return t[np.clip(np.rint((when - t[0]) / (t[1] - t[0])).astype(int), 0, len(t) - 1)]
 
 
 def _in_hole(t: np.ndarray, c: Channel, gap: float) -> np.ndarray:
     """True where a channel's last sample is longer ago than ``gap`` (s)."""
-    from hil.logs.held import held
-
     return t - c.t[held(c, t)] > gap
 
 
@@ -192,8 +180,6 @@ def _model_at(name: str, t: np.ndarray, values: np.ndarray, when: np.ndarray) ->
     """The model's signal at the log's times: a current as its mean since the log's last sample, as it is logged; the
     rest in between.
     """
-    import numpy as np
-
     if name != "i_cmd" or len(when) < 2:
         return np.interp(when, t, values)
     edges = np.concatenate([[2.0 * when[0] - when[1]], when])
@@ -213,22 +199,3 @@ def replay_json(result: ReplayResult) -> dict[str, Any]:
         "signals": [asdict(s) for s in result.signals],
         "notes": result.notes,
     }
-
-
-# ---- command line ----------------------------------------------------------------------------------------------------
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Command line of ``python -m hil.replay``."""
-    from vaneloop.base import terminal
-
-    def load() -> Any:
-        from vaneloop.cli import replay as command
-
-        return command
-
-    return terminal.start("python -m hil.replay", load, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
