@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, overload
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 from pydantic import model_validator
 
@@ -258,8 +259,6 @@ def stroke_for_vigv(
 
     Raises InputError for an angle that no stroke from -2 to 50 mm gives.
     """
-    from scipy.optimize import brentq
-
     g = _flat(geometry)
     low, high = stage_vane_angle(STROKE_LOW, g, 0), stage_vane_angle(STROKE_HIGH, g, 0)
     a = np.atleast_1d(np.asarray(angle, dtype=float))
@@ -270,7 +269,7 @@ def stroke_for_vigv(
                 f"vigv angle (={target / DEG:g} deg) must be in [{low / DEG:.4g}, {high / DEG:.4g}], what the stroke "
                 f"can give"
             )
-        out.flat[i] = brentq(
+        out.flat[i] = scipy.optimize.brentq(
             lambda x, t=target: stage_vane_angle(x, g, 0) - t, STROKE_LOW, STROKE_HIGH, xtol=1e-12, rtol=1e-14
         )
     return float(out[0]) if np.ndim(angle) == 0 else out

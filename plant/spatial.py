@@ -29,6 +29,7 @@ import math
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from plant.geometry import DEG, MM, Geometry
@@ -328,8 +329,6 @@ def clearance_for(
     Raises InputError where the others alone are wider, or 5 mm are not enough.
     """
 
-    from scipy.optimize import brentq
-
     def miss(value: float) -> float:
         return clearance_width(geometry, stage, replace(clearances, **{joint: value}), vane, offset) - width
 
@@ -339,4 +338,4 @@ def clearance_for(
             f"{stage}: no clearance of {joint} gives a width of {width:g} deg: the others alone make {low + width:.3g} "
             f"deg, 5 mm of it {high + width:.3g} deg"
         )
-    return float(brentq(miss, 0.0, 5.0, xtol=1e-6))
+    return float(scipy.optimize.brentq(miss, 0.0, 5.0, xtol=1e-6))

@@ -24,6 +24,7 @@ from vaneloop.design.servo import (
     sampled_loop,
 )
 from vaneloop.design.servo_design import MIDDLE, DesignResult, design, evaluate, summary
+from vaneloop.design.servo_motor import plant_of_tables
 from vaneloop.design.servo_simulation import ramp_demand, simulate, steady_cycle
 from vaneloop.pages.design import design_page
 
@@ -120,7 +121,7 @@ def test_stated_limits_hold_at_every_corner(result: DesignResult) -> None:
 
 def test_the_calibrated_gains_are_the_designed_ones() -> None:
     assert default_gains() == GAINS
-    assert ServoPlant.from_tables() == PLANT
+    assert plant_of_tables() == PLANT
 
 
 def test_linear_simulation_follows_controls_step(result: DesignResult) -> None:

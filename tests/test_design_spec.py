@@ -37,7 +37,7 @@ from vaneloop.design.servo import (
     sampled_loop,
 )
 from vaneloop.design.servo_design import Check, DesignResult, Limits, PlayFigures, design, evaluate, summary
-from vaneloop.design.servo_motor import MotorCorner, MotorServoPlant
+from vaneloop.design.servo_motor import MotorCorner, MotorServoPlant, plant_of_tables
 from vaneloop.design.servo_simulation import Trajectory, ramp_demand, simulate, steady_cycle
 
 GAINS = Gains(12.0, 90.0, 0.2)
@@ -89,7 +89,7 @@ def test_the_plant_of_a_table_is_its_numbers_in_si(tmp_path) -> None:
         assert old in text
         text = text.replace(old, new)
     (tmp_path / "plant.toml").write_text(text)
-    p = ServoPlant.from_tables(tmp_path / "plant.toml")
+    p = plant_of_tables(tmp_path / "plant.toml")
     assert type(p) is ServoPlant and p.hysteretic
     assert (p.rated_current, p.bandwidth, p.damping, p.flow_gain, p.pressure) == pytest.approx(
         (0.050, 71.0, 0.7, 0.14, 19e6)
@@ -98,12 +98,12 @@ def test_the_plant_of_a_table_is_its_numbers_in_si(tmp_path) -> None:
     assert p.lvdt_step == pytest.approx(50e-3 / 2**14)
     assert p.current_limit == pytest.approx(values("calibration.toml")["servo"]["current_limit"] * 1e-3)
     assert (p.p_ref, p.tick, p.delay) == (21e6, 1e-3, 0)
-    assert ServoPlant.from_tables() == ServoPlant()  # the defaults are the shipped table's
+    assert plant_of_tables() == ServoPlant()  # the defaults are the shipped table's
 
 
 def test_the_electromechanical_plant_of_a_table_is_its_numbers_in_si() -> None:
     t = values("plant_electromechanical.toml")
-    p = ServoPlant.from_tables("plant_electromechanical.toml")
+    p = plant_of_tables("plant_electromechanical.toml")
     assert isinstance(p, MotorServoPlant) and not p.hysteretic
     per_radian = t["screw"]["lead"] * 1e-3 / (2 * math.pi) / t["gear"]["ratio"]  # m of rod for 1 rad of the motor
     expected = {
@@ -515,7 +515,7 @@ def test_the_lvdts_noise_and_its_steps_are_in_what_the_firmware_reads() -> None:
 def test_the_motors_step_is_the_plants_own() -> None:
     from plant import build_plant, chain, places
 
-    plant = ServoPlant.from_tables("plant_electromechanical.toml")
+    plant = plant_of_tables("plant_electromechanical.toml")
     step = plant.stepper(24e-3, 10)
     machine = build_plant("plant_electromechanical.toml")
     s = machine.start(24e-3, 80.0)

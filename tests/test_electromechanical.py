@@ -26,7 +26,8 @@ from tests.firmware_on_rig import firmware
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path
 from vaneloop.cli.main import main
-from vaneloop.design.servo import ServoPlant, default_gains, margins
+from vaneloop.design.servo import default_gains, margins
+from vaneloop.design.servo_motor import plant_of_tables
 from vaneloop.identification.vane_chain.chain import build_chain
 from vaneloop.verbs.search import diagnosed
 
@@ -376,7 +377,7 @@ def test_a_model_file_may_name_only_effects_and_parameters_that_the_machine_has(
 
 
 def test_the_shipped_gains_keep_their_margins_around_the_motor_at_every_corner() -> None:
-    plant = ServoPlant.from_tables(TABLE)
+    plant = plant_of_tables(TABLE)
     s = 2j * np.pi * np.array([1e-6, 0.1])
     assert plant.response(s)[0] == pytest.approx(1.0, abs=1e-3) and plant.speed_per_ampere == pytest.approx(3.75)
     gains = default_gains()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import math
 from dataclasses import dataclass, replace
@@ -381,7 +380,7 @@ def test_a_page_says_which_version_wrote_it(monkeypatch: pytest.MonkeyPatch) -> 
     def missing(_: str) -> str:
         raise PackageNotFoundError
 
-    monkeypatch.setattr(importlib.metadata, "version", missing)
+    monkeypatch.setattr(page_module, "version", missing)
     assert _version() == "vaneloop (not installed)"
 
 

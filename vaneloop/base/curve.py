@@ -5,6 +5,7 @@ fitted or learned.
 from __future__ import annotations
 
 import numpy as np
+import scipy
 
 from vaneloop.base.compiled import inlined
 
@@ -76,7 +77,5 @@ def between_points(x: float, low: float, high: float, points: int) -> tuple[int,
 
 def splines(knots: np.ndarray, x: np.ndarray) -> np.ndarray:
     """The B-splines of these ``knots`` at ``x``, float64[len(x), splines]; beyond the ends as there."""
-    from scipy.interpolate import BSpline
-
     inside = np.clip(np.asarray(x, dtype=float), knots[DEGREE], knots[-DEGREE - 1])
-    return np.asarray(BSpline(knots, np.eye(len(knots) - DEGREE - 1), DEGREE)(inside))
+    return np.asarray(scipy.interpolate.BSpline(knots, np.eye(len(knots) - DEGREE - 1), DEGREE)(inside))

@@ -1,5 +1,6 @@
 """What every part of VaneLoop raises for bad input. Only the standard library, so that help is quick."""
 
+import difflib
 from collections.abc import Iterable
 
 __all__ = ["InputError", "meant"]
@@ -11,8 +12,6 @@ class InputError(ValueError):
 
 def meant(word: str, allowed: Iterable[str]) -> str:
     """Words that ask whether another one of ``allowed`` was meant; "" where none is near."""
-    import difflib
-
     fold = {a.casefold(): a for a in allowed}
     near = difflib.get_close_matches(word.casefold(), fold, 1, 0.6)
     return f" (did you mean {fold[near[0]]}?)" if near else ""

@@ -16,8 +16,13 @@ import os
 import re
 import select
 import sys
+import tempfile
+import termios
+import traceback
+import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, NoReturn
 
 from vaneloop.base.errors import InputError, meant
@@ -316,8 +321,6 @@ def _wrapped(kind: type[_Output], fd: int, stream: Any) -> Any:
 
 def is_terminal(stream: Any) -> bool:
     """Whether a stream is a terminal that says how it is set; one that refuses is none."""
-    import termios
-
     try:
         termios.tcgetattr(stream.fileno())
     except (AttributeError, OSError, ValueError, termios.error):
@@ -330,9 +333,6 @@ def keyboard(stream: Any) -> Iterator[int | None]:
     """Give the descriptor of a terminal whose keys come at once, or None where ``stream`` is none that controls this
     process and answers every call. The terminal is as it was afterwards.
     """
-    import termios
-    import tty
-
     try:
         fd = stream.fileno()
         ours = os.tcgetpgrp(fd) == os.getpgrp()
@@ -369,10 +369,6 @@ def defect(e: BaseException) -> str:
     """One line for an error that no input should cause. The traceback goes into a file, or to standard error with
     VANELOOP_DEBUG=1.
     """
-    import tempfile
-    import traceback
-    from pathlib import Path
-
     if isinstance(e, MemoryError):
         return "the machine's memory does not suffice for this"
     if type(e).__name__ == "BrokenProcessPool":

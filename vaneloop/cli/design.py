@@ -7,8 +7,6 @@ import argparse
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.cli.options import add_plant_option
-from vaneloop.design.servo_design import evaluate, summary
-from vaneloop.pages.design import design_page
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -41,6 +39,9 @@ def command(args: argparse.Namespace) -> int:
         value = getattr(args, name)
         if value is not None and not 0.0 <= value <= 1e6:
             raise InputError(f"--{name} (={value:g}) must be in [0, 1e6]")
+    from vaneloop.design.servo_design import evaluate, summary
+    from vaneloop.pages.design import design_page
+
     result, code = evaluate(
         kp=args.kp, ki=args.ki, kff=args.kff, backlash_inside=args.backlash_inside, plant=args.plant or "plant.toml"
     )

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from plant.spatial import Clearances, clearance_for, clearance_loop, clearance_width, contributions, freedoms
+from vaneloop.base.errors import InputError
+
 if TYPE_CHECKING:
-    import numpy as np
-
     from plant import Geometry
-    from plant.spatial import Clearances
-
 __all__ = ["FITS", "ClearanceStudy", "clearance_study"]
 
 # mm. Chosen: running fits as new (H8/f7 on 10 to 18 mm: 0.016 to 0.061 mm) at the pivots, as much in each spherical
@@ -67,11 +68,6 @@ def clearance_study(
     vane  deg along the ring from the right clevis to the measured vane; -90 is the lowest
     Raises InputError where the fits alone are wider than the width, or no clearance reaches it.
     """
-    import numpy as np
-
-    from plant.spatial import Clearances, clearance_for, clearance_loop, clearance_width, contributions, freedoms
-    from vaneloop.base.errors import InputError
-
     fits.check()
     if ring is None:
         ring = clearance_for(geometry, stage, width, replace(fits, ring=0.0), "ring", vane)

@@ -9,7 +9,9 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import control as ct
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from vaneloop.base.errors import InputError
@@ -59,8 +61,6 @@ def play_describing_function(amplitude: ArrayLike, gap: float) -> Complex:
 
     From `control.friction_backlash_nonlinearity`, whose argument is the *total* gap. 0 for A <= gap/2.
     """
-    import control as ct
-
     f = ct.friction_backlash_nonlinearity(gap)
     a = np.atleast_1d(np.asarray(amplitude, dtype=float))
     out = np.array([complex(f.describing_function(float(v))) for v in a])
@@ -75,8 +75,6 @@ def limit_cycles(response: Any, gap: float, low: float, high: float) -> list[Lim
     right too. Only oscillations that hold themselves (a greater amplitude decays) are returned: at a crossing of the
     other kind the loop leaves it.
     """
-    from scipy.optimize import brentq
-
     if gap <= 0.0:
         return []
     # phase and magnitude of N as functions of x = A / (gap/2) > 1; both rise from (-90 deg, 0) to (0, 1)
@@ -99,7 +97,7 @@ def limit_cycles(response: Any, gap: float, low: float, high: float) -> list[Lim
     for a, b, va, vb in zip(grid, grid[1:], level, level[1:], strict=False):
         if not (np.isfinite(va) and np.isfinite(vb) and va * vb < 0.0):
             continue
-        w = float(brentq(lambda v: mismatch(at(v)), a, b, rtol=1e-10))
+        w = float(scipy.optimize.brentq(lambda v: mismatch(at(v)), a, b, rtol=1e-10))
         wanted = math.remainder(math.pi - np.angle(at(w)), 2.0 * math.pi)
         ratio = float(np.interp(wanted, phase, x))
         amplitude = ratio * gap / 2.0
@@ -118,8 +116,6 @@ def harmonic_balance(
     The describing function is this with one harmonic. At most ``count`` harmonics, none above ``highest`` rad/s. None
     if the balance is not found. Source: Gelb, Vander Velde (1968), ch. 3.
     """
-    from scipy.optimize import root
-
     k = 2 * np.arange(count) + 1
     k = k[k * start.omega * 1.5 < highest]
     n = 256
@@ -145,7 +141,7 @@ def harmonic_balance(
 
     first = np.zeros(2 * k.size)
     first[1] = start.amplitude / gap
-    answer = root(balance, first, method="hybr", tol=1e-10)
+    answer = scipy.optimize.root(balance, first, method="hybr", tol=1e-10)
     w, harmonics = unpack(answer.x)
     if np.abs(balance(answer.x)).max() > 1e-5 or not 0.5 < harmonics[0].real < 1e3 or k[-1] * w > highest:
         return None

@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
@@ -208,10 +209,8 @@ def _without_spikes(x: Array) -> Array:
     A leap is 0.3 mm and more than a usual step off the median of the seven samples around it and off both lines,
     through the two samples before and the two after it; the corner of a ramp lies on one of them.
     """
-    from scipy.ndimage import median_filter
-
     least = 0.3 + float(np.quantile(np.abs(np.diff(x)), 0.8))
-    far = np.abs(x - median_filter(x, 7, mode="nearest")) > least
+    far = np.abs(x - scipy.ndimage.median_filter(x, 7, mode="nearest")) > least
     good = np.flatnonzero(~far)
     if good.size < 4:
         return x

@@ -7,6 +7,7 @@ the command's JSON.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -181,6 +182,4 @@ def _axis(name: str, unit: str, origin: str, row: Array) -> list[str]:
 
 def _quoted(text: str) -> str:
     """Text as a TOML basic string."""
-    import json
-
     return json.dumps(text, ensure_ascii=False)

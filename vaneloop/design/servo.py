@@ -26,16 +26,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING
 
+import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from controller.calibration import CalibrationTable
+from plant.actuator import speed_factor, stroke_step
+from plant.valve import valve_matrix, valve_step
 from vaneloop.base.errors import InputError
-
-if TYPE_CHECKING:
-    import control
+from vaneloop.base.tables import read
 
 __all__ = [
     "Corner",
@@ -82,7 +82,8 @@ class Gains:
 
 @dataclass(frozen=True)
 class ServoPlant:
-    """Valve, actuator, LVDT and sampling as the loop sees them; SI. Defaults: `from_tables` reads the shipped ones."""
+    """Valve, actuator, LVDT and sampling as the loop sees them; SI. Defaults: those of the shipped tables, which
+    `servo_motor.plant_of_tables` reads."""
 
     rated_current: float = 0.040  # A
     bandwidth: float = 60.0  # Hz, undamped natural frequency of the valve
@@ -97,39 +98,6 @@ class ServoPlant:
     current_limit: float = 0.040  # A
     tick: float = 1e-3  # s
     delay: int = 0  # ticks of computation delay (a tick is 1 ms)
-
-    @classmethod
-    def from_tables(cls, plant: str | Path = "plant.toml") -> ServoPlant:
-        """Read a plant table, whatever the kind of its actuator; the current limit comes from ``calibration.toml``."""
-        from controller.calibration import CalibrationTable
-        from plant.parameters import ElectromechanicalTable, read_plant
-        from vaneloop.base.tables import read
-        from vaneloop.design.servo_motor import MotorServoPlant
-
-        t = read_plant(plant)
-        limit = read("calibration.toml", CalibrationTable).servo.current_limit.value
-        if isinstance(t, ElectromechanicalTable):
-            return MotorServoPlant.of(
-                t,
-                plant,
-                stroke=t.actuator.stroke.value * 1e-3,
-                lvdt_lag=t.sensors.lvdt_lag.value * 1e-3,
-                lvdt_noise=t.sensors.lvdt_noise.value * 1e-3,
-                lvdt_step=t.sensors.lvdt_range.value * 1e-3 / 2.0**t.sensors.lvdt_bits.value,
-                current_limit=limit * 1e-3,
-            )
-        return cls(
-            rated_current=t.valve.rated_current.value * 1e-3,
-            bandwidth=t.valve.bandwidth.value,
-            damping=t.valve.damping.value,
-            flow_gain=t.actuator.flow_gain.value,
-            pressure=t.supply.pressure.value * 1e6,
-            stroke=t.actuator.stroke.value * 1e-3,
-            lvdt_lag=t.sensors.lvdt_lag.value * 1e-3,
-            lvdt_noise=t.sensors.lvdt_noise.value * 1e-3,
-            lvdt_step=t.sensors.lvdt_range.value * 1e-3 / 2.0**t.sensors.lvdt_bits.value,
-            current_limit=limit * 1e-3,
-        )
 
     @property
     def speed_per_ampere(self) -> float:
@@ -172,9 +140,6 @@ class ServoPlant:
         """Return the plant's own step of a tick's ``substeps``-th part, from rest at the stroke ``x`` (m): from current
         (A) to stroke (m).
         """
-        from plant.actuator import speed_factor, stroke_step
-        from plant.valve import valve_matrix, valve_step
-
         dt = self.tick / substeps
         matrix = valve_matrix(self.bandwidth, self.damping, dt)
         speed = self.flow_gain * speed_factor(self.pressure, 0.0, self.p_ref)
@@ -192,9 +157,6 @@ class ServoPlant:
 
 def default_gains() -> Gains:
     """The gains in ``calibration.toml``."""
-    from controller.calibration import CalibrationTable
-    from vaneloop.base.tables import read
-
     servo = read("calibration.toml", CalibrationTable).servo
     return Gains(servo.kp.value, servo.ki.value, servo.kff.value)
 
@@ -202,22 +164,18 @@ def default_gains() -> Gains:
 # ---------------------------------------------------------------- the open loop
 
 
-def _s_plant(plant: ServoPlant) -> control.TransferFunction:
+def _s_plant(plant: ServoPlant) -> ct.TransferFunction:
     """From current (A) to measured stroke (m)."""
-    import control as ct
-
     valve = ct.tf(*plant.dynamics())
     actuator = ct.tf([plant.speed_per_ampere], [1.0, 0.0])
     lvdt = ct.tf([1.0], [plant.lvdt_lag, 1.0])
     return valve * actuator * lvdt
 
 
-def continuous_loop(gains: Gains, plant: ServoPlant, order: int = 4) -> control.TransferFunction:
+def continuous_loop(gains: Gains, plant: ServoPlant, order: int = 4) -> ct.TransferFunction:
     """Loop transfer function L(s) with the delay of half a tick and of the computation as a Pade approximation of
     ``order``.
     """
-    import control as ct
-
     pi = ct.tf([gains.kp, gains.ki], [1.0, 0.0]) if gains.ki else ct.tf([gains.kp], [1.0])
     delay = ct.tf(*ct.pade(plant.tick * (0.5 + plant.delay), order))
     return pi * _s_plant(plant) * delay
@@ -230,27 +188,23 @@ def continuous_response(gains: Gains, plant: ServoPlant, omega: ArrayLike) -> Co
     return np.asarray((gains.kp + gains.ki / s) * path * np.exp(-s * plant.tick * (0.5 + plant.delay)))
 
 
-def _sampled_plant(plant: ServoPlant) -> control.StateSpace:
+def _sampled_plant(plant: ServoPlant) -> ct.StateSpace:
     """From current (A, held for a tick) to the LVDT's sample (m), computation delay included."""
-    import control as ct
-
     p = ct.sample_system(ct.ss(_s_plant(plant)), plant.tick, method="zoh")
     if plant.delay:
         p = p * ct.ss(ct.tf([1.0], [1.0] + [0.0] * plant.delay, plant.tick))
     return p
 
 
-def _sampled_pi(gains: Gains, plant: ServoPlant) -> control.StateSpace:
+def _sampled_pi(gains: Gains, plant: ServoPlant) -> ct.StateSpace:
     """kp + ki T z/(z - 1): the firmware adds a tick's error to the integral before it uses it."""
-    import control as ct
-
     if not gains.ki:
         return ct.ss([], [], [], [[gains.kp]], plant.tick)
     # state: the integral before this tick
     return ct.ss([[1.0]], [[gains.ki * plant.tick]], [[1.0]], [[gains.kp + gains.ki * plant.tick]], plant.tick)
 
 
-def sampled_loop(gains: Gains, plant: ServoPlant) -> control.StateSpace:
+def sampled_loop(gains: Gains, plant: ServoPlant) -> ct.StateSpace:
     """Loop transfer function L(z) as the firmware closes it: exact zero-order hold, tick of ``plant.tick``."""
     return _sampled_plant(plant) * _sampled_pi(gains, plant)
 
@@ -286,17 +240,13 @@ def frequency_grid(plant: ServoPlant, points: int = 2500) -> Array:
     return np.geomspace(2.0 * math.pi * 0.05, 0.999 * math.pi / plant.tick, points)
 
 
-def frequency_response(system: control.StateSpace, omega: Array) -> Complex:
+def frequency_response(system: ct.StateSpace, omega: Array) -> Complex:
     """Frequency response of a loop with one input and one output."""
-    import control as ct
-
     return np.asarray(ct.frequency_response(system, np.atleast_1d(omega), squeeze=False).complex, dtype=complex)[0, 0]
 
 
 def margins(gains: Gains, plant: ServoPlant, omega: Array | None = None) -> Margins:
     """Margins of the sampled loop, from `control.stability_margins` and `control.disk_margins`."""
-    import control as ct
-
     omega = frequency_grid(plant) if omega is None else omega
     loop = sampled_loop(gains, plant)
     closed = ct.feedback(loop, 1)
@@ -331,8 +281,6 @@ def margins(gains: Gains, plant: ServoPlant, omega: Array | None = None) -> Marg
 
 def noise_current(gains: Gains, plant: ServoPlant) -> float:
     """Current (A rms) that the LVDT's white noise makes: the 2-norm of -C/(1 + P C) times the noise's rms."""
-    import control as ct
-
     transfer = ct.feedback(_sampled_pi(gains, plant), _sampled_plant(plant))
     omega = np.linspace(0.0, math.pi / plant.tick, 40001)[1:]
     power = np.abs(frequency_response(transfer, omega)) ** 2

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import control as ct
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -30,6 +31,7 @@ from vaneloop.design.servo import (
     noise_current,
     sampled_loop,
 )
+from vaneloop.design.servo_motor import plant_of_tables
 from vaneloop.design.servo_simulation import ramp_demand, simulate, steady_cycle
 
 __all__ = [
@@ -148,8 +150,6 @@ def _step_figures(gains: Gains, plant: ServoPlant, curves: dict[str, Any]) -> di
     """Linear step (no feed-forward, no limit), and 10 mm as a bare step and as the firmware would draw it (100
     mm/s).
     """
-    import control as ct
-
     closed = ct.feedback(sampled_loop(gains, plant), 1)
     t = np.arange(0.0, 1.0, plant.tick)
     y = np.asarray(ct.step_response(closed, t).outputs).ravel()
@@ -302,7 +302,7 @@ def design(
     backlash_outside  m of stroke, total play between piston and vanes (1.6 deg of VIGV)
     """
     gains = gains or default_gains()
-    plant = plant or ServoPlant.from_tables()
+    plant = plant or plant_of_tables()
     limits = limits or Limits()
     curves: dict[str, Any] = {}
     nominal, corners = analyse(gains, plant)
@@ -389,7 +389,7 @@ def evaluate(
     if backlash_inside is not None and not 0.0 <= backlash_inside <= 10.0:
         raise InputError(f"backlash_inside (={backlash_inside:g} mm) must be in [0, 10]")
     inside = BACKLASH_INSIDE if backlash_inside is None else backlash_inside * 1e-3
-    result = design(gains, ServoPlant.from_tables(plant), backlash_inside=inside)
+    result = design(gains, plant_of_tables(plant), backlash_inside=inside)
     return result, 0 if result.ok else 1
 
 

@@ -22,9 +22,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from controller.calibration import CalibrationTable
+from plant import build_plant, chain, places
+from plant.parameters import ElectromechanicalTable, derive, read_plant
+from vaneloop.base.tables import read
 from vaneloop.design.servo import Complex, Margins, ServoPlant
 
-__all__ = ["MotorCorner", "MotorServoPlant"]
+__all__ = ["MotorCorner", "MotorServoPlant", "plant_of_tables"]
 
 
 @dataclass(frozen=True)
@@ -124,9 +128,6 @@ class MotorServoPlant(ServoPlant):
 
     def stepper(self, x: float, substeps: int) -> Callable[[float], float]:
         """The plant's own step, from rest at the stroke ``x`` (m)."""
-        from plant import build_plant, chain, places
-        from plant.parameters import derive
-
         machine = build_plant(self.table)
         p, s = machine.p.copy(), machine.start(x, 0.0)
         dt = self.tick / substeps
@@ -137,3 +138,25 @@ class MotorServoPlant(ServoPlant):
             return float(s[places.X, 0])
 
         return step
+
+
+def plant_of_tables(plant: str | Path = "plant.toml") -> ServoPlant:
+    """Read a plant table, whatever the kind of its actuator; the current limit comes from ``calibration.toml``."""
+    t = read_plant(plant)
+    common = {
+        "stroke": t.actuator.stroke.value * 1e-3,
+        "lvdt_lag": t.sensors.lvdt_lag.value * 1e-3,
+        "lvdt_noise": t.sensors.lvdt_noise.value * 1e-3,
+        "lvdt_step": t.sensors.lvdt_range.value * 1e-3 / 2.0**t.sensors.lvdt_bits.value,
+        "current_limit": read("calibration.toml", CalibrationTable).servo.current_limit.value * 1e-3,
+    }
+    if isinstance(t, ElectromechanicalTable):
+        return MotorServoPlant.of(t, plant, **common)
+    return ServoPlant(
+        rated_current=t.valve.rated_current.value * 1e-3,
+        bandwidth=t.valve.bandwidth.value,
+        damping=t.valve.damping.value,
+        flow_gain=t.actuator.flow_gain.value,
+        pressure=t.supply.pressure.value * 1e6,
+        **common,
+    )

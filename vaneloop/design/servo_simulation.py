@@ -10,6 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from controller import new_state
+from controller.records import SCALAR_FIELDS, as_state, record
+from controller.servo import servo_step
+from plant.play import play_step
+from plant.sensors import lag_factor, quantise
 from vaneloop.design.limit_cycles import LimitCycle, Play
 from vaneloop.design.servo import Gains, ServoPlant
 
@@ -69,12 +74,6 @@ def simulate(
                     come from below
     integral        A, integral part at t = 0
     """
-    from controller import new_state
-    from controller.records import SCALAR_FIELDS, as_state, record
-    from controller.servo import servo_step
-    from plant.play import play_step
-    from plant.sensors import lag_factor, quantise
-
     ref = np.asarray(x_ref, dtype=float)
     rate = np.zeros_like(ref) if dx_ref is None else np.asarray(dx_ref, dtype=float)
     z, k = as_state(new_state()), record(SCALAR_FIELDS)

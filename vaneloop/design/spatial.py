@@ -5,11 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from plant.geometry import vane_angles
+from plant.spatial import spatial_angles
+from vaneloop.base.errors import InputError
 from vaneloop.base.extras import is_there
+from vaneloop.design.multibody import multibody_angles
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from plant import Geometry
 
 __all__ = ["SpatialCheck", "spatial_check"]
@@ -42,13 +46,6 @@ def spatial_check(geometry: Geometry, offset: float = 0.0, points: int = 97, pro
     offset  mm along the engine's axis between the crank's plane and the clevis' where the vane angle is 0
     Raises InputError, naming stage and stroke, where a stage does not close.
     """
-    import numpy as np
-
-    from plant.geometry import vane_angles
-    from plant.spatial import spatial_angles
-    from vaneloop.base.errors import InputError
-    from vaneloop.design.multibody import multibody_angles
-
     if not -100.0 <= offset <= 100.0:
         raise InputError(f"--offset (={offset:g} mm) must be in [-100, 100]")
     if not 2 <= points <= 10_000:

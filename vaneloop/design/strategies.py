@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from controller import STRATEGIES, Calibration
@@ -173,10 +174,10 @@ def casing(n_dem: Array) -> Array:
     """Temperature (degC) that the casing has under a demand (%, every 10 ms): first-order lag behind the engine's
     power.
     """
-    from scipy.signal import lfilter
-
     share = 1e-2 / HEATING
-    return T_REF + HEAT * lfilter([share], [1.0, share - 1.0], np.clip((n_dem - IDLE) / (FULL - IDLE), 0.0, 1.0))
+    return T_REF + HEAT * scipy.signal.lfilter(
+        [share], [1.0, share - 1.0], np.clip((n_dem - IDLE) / (FULL - IDLE), 0.0, 1.0)
+    )
 
 
 def dithered(n_dem: Array, amplitude: float) -> Array:

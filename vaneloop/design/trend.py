@@ -22,6 +22,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import scipy
+from filterpy.common import Q_discrete_white_noise
+from filterpy.kalman import KalmanFilter
 from numpy.typing import ArrayLike, NDArray
 
 from controller import new_state
@@ -74,8 +77,6 @@ class TrendModel:
 
     def matrices(self) -> tuple[Array, Array, Array, Array]:
         """F, H, Q, R; Q from `filterpy.common.Q_discrete_white_noise`."""
-        from filterpy.common import Q_discrete_white_noise
-
         f = np.array([[1.0, self.step], [0.0, 1.0]])
         h = np.array([[1.0, 0.0]])
         q = np.asarray(Q_discrete_white_noise(dim=2, dt=self.step, var=self.acceleration**2), dtype=float)
@@ -87,8 +88,6 @@ class TrendModel:
 
 def _filter(model: TrendModel, first: float) -> Any:
     """A filterpy KalmanFilter at rest on the demand ``first``."""
-    from filterpy.kalman import KalmanFilter
-
     kf = KalmanFilter(dim_x=2, dim_z=1)
     kf.F, kf.H, kf.Q, kf.R = model.matrices()
     kf.x = np.array([[first], [0.0]])
@@ -111,10 +110,8 @@ def filterpy_gain(model: TrendModel, steps: int = 20_000) -> tuple[float, float]
 
 def riccati_gain(model: TrendModel) -> tuple[float, float]:
     """(alpha, beta) from the discrete algebraic Riccati equation."""
-    from scipy.linalg import solve_discrete_are
-
     f, h, q, r = model.matrices()
-    p = solve_discrete_are(f.T, h.T, q, r)
+    p = scipy.linalg.solve_discrete_are(f.T, h.T, q, r)
     k = p @ h.T / (h @ p @ h.T + r)
     return float(k[0, 0]), float(k[1, 0]) * model.step
 
@@ -138,12 +135,10 @@ def filterpy_estimates(
     """Demand and rate (%, %/s) as filterpy's filter estimates them, started in its steady state, at rest on the first
     sample.
     """
-    from scipy.linalg import solve_discrete_are
-
     y = np.asarray(n_dem, dtype=float)
     kf = _filter(model, float(y[0]))
     f, h, q, r = model.matrices()
-    p = solve_discrete_are(f.T, h.T, q, r)
+    p = scipy.linalg.solve_discrete_are(f.T, h.T, q, r)
     k = p @ h.T / (h @ p @ h.T + r)
     kf.P = (np.eye(2) - k @ h) @ p  # after an update
     out = np.empty((2, y.size))
@@ -248,10 +243,8 @@ def rate_noise(alpha: float, beta: float, model: TrendModel) -> tuple[float, flo
     """(rms of the rate in %/s, its correlation from one step to the next) under the demand's noise, by the Lyapunov
     equation.
     """
-    from scipy.linalg import solve_discrete_lyapunov
-
     a, b = _error_system(alpha, beta, model.step)
-    c = solve_discrete_lyapunov(a, b @ b.T * model.sigma**2)
+    c = scipy.linalg.solve_discrete_lyapunov(a, b @ b.T * model.sigma**2)
     return math.sqrt(c[1, 1]), float((a @ c)[1, 1] / c[1, 1])
 
 

@@ -10,15 +10,14 @@ import numpy as np
 
 from vaneloop.design.limit_cycles import play_describing_function
 from vaneloop.design.servo_design import MIDDLE, DesignResult
+from vaneloop.pages.figures import Line, Panel, loop, overlay
+from vaneloop.pages.page import Page
 
 __all__ = ["design_page"]
 
 
 def design_page(result: DesignResult, path: str | Path) -> Path:
     """Write a self-contained HTML page: checks, open loop, Nyquist with the disk, steps, ramp, limit cycles."""
-    from vaneloop.pages.figures import Line, Panel, loop, overlay
-    from vaneloop.pages.page import Page
-
     g, m, c = result.gains, result.nominal, result.curves
     missed = [k.name for k in result.checks if not k.ok]
     verdict = "All stated limits hold." if result.ok else "Not held: " + "; ".join(missed) + "."

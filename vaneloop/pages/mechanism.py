@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from vaneloop.design.clearance import WORDS, ClearanceStudy, study_rows
 from vaneloop.design.spatial import SpatialCheck
+from vaneloop.pages.figures import Line, Panel, bars, overlay
+from vaneloop.pages.page import Page
 from vaneloop.pages.style import STAGE_ROLES
 
 __all__ = ["clearance_page", "spatial_page"]
@@ -13,9 +17,6 @@ __all__ = ["clearance_page", "spatial_page"]
 
 def clearance_page(studies: list[ClearanceStudy], path: str, command: str, vane: float) -> Any:
     """Write the page of `vaneloop clearance`; return its path."""
-    from vaneloop.pages.figures import Line, Panel, bars, overlay
-    from vaneloop.pages.page import Page
-
     names = [s.stage.upper() for s in studies]
     ring = ", ".join(f"{n} {s.clearances.ring:.2f} mm" for n, s in zip(names, studies, strict=True))
     widths = ", ".join(f"{s.made:.2f}" for s in studies)
@@ -80,11 +81,6 @@ def clearance_page(studies: list[ClearanceStudy], path: str, command: str, vane:
 
 def spatial_page(check: SpatialCheck, path: str, command: str) -> Any:
     """Write the page of `vaneloop spatial`; return its path."""
-    import numpy as np
-
-    from vaneloop.pages.figures import Line, Panel, overlay
-    from vaneloop.pages.page import Page
-
     by = "Exudyn, a general multibody library" if check.multibody else "Newton's method on the constraint equations"
     vanes = tuple(check.planar)
     worst = {s: float(np.max(np.abs(check.difference(s)))) for s in vanes}

@@ -19,6 +19,7 @@ import html
 import json
 import math
 from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -219,8 +220,6 @@ def _tile(t: Tile) -> str:
 
 def _version() -> str:
     """Version of the installed distribution."""
-    from importlib.metadata import PackageNotFoundError, version
-
     try:
         return "vaneloop " + version("vaneloop")
     except PackageNotFoundError:

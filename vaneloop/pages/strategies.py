@@ -11,6 +11,9 @@ from controller import STRATEGIES
 from plant import Plant
 from plant.effect import T_REF
 from vaneloop.design.strategies import FIGURES, HEAT, STEP, Failure, Outcome, Outcomes, Scenario, casing
+from vaneloop.pages.figures import Line, Panel, bars, loop, overlay
+from vaneloop.pages.page import Page
+from vaneloop.pages.style import number
 
 __all__ = ["report"]
 
@@ -29,10 +32,6 @@ def report(
     words: str = "",
 ) -> Path:
     """Write the page; return its path."""
-    from vaneloop.pages.figures import Line, Panel, bars, loop, overlay
-    from vaneloop.pages.page import Page
-    from vaneloop.pages.style import number
-
     last = rows[-1]
     both = dual, mine = outcomes[last.name, "dual"], outcomes[last.name, best]
     errors = [o.figures["vigv"] for o in (dual, mine)]
