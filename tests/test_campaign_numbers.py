@@ -362,10 +362,8 @@ def test_a_trial_s_file_says_what_is_to_be_done(tmp_path: Path, monkeypatch: pyt
 
 
 def test_warming_up_compiles_the_loop_and_runs_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
-    import hil.loop.lockstep
-
     seen: list[Any] = []
-    monkeypatch.setattr(hil.loop.lockstep, "warm_up", lambda told: seen.append(told("x")))
+    monkeypatch.setattr(trial, "warm_up", lambda told: seen.append(told("x")))
     monkeypatch.setattr(trial, "run", lambda scenario: seen.append(scenario.duration))
     trial.run_trial.warm_up({}, "")
     assert seen == [None, 0.1]

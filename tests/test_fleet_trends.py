@@ -694,12 +694,10 @@ def test_limits_are_read_from_two_columns_and_perhaps_others(tmp_path: Path) -> 
 
 
 def test_each_log_that_the_page_leads_to_has_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import vaneloop.pages.fleet
-
     def page(key: str, answer: dict[str, Any]) -> Any:
         return SimpleNamespace(write=lambda file: file.write_text(f"{key} {answer}"))
 
-    monkeypatch.setattr(vaneloop.pages.fleet, "log_page", page)
+    monkeypatch.setattr(report, "log_page", page)
     for _ in range(2):
         report.write_pages(tmp_path / "deep" / "logs", {"a": {"n": 1}, "b": {}})
     said = {f.name: f.read_text() for f in (tmp_path / "deep" / "logs").iterdir()}

@@ -865,7 +865,7 @@ def test_a_hired_worker_answers_with_a_line(
             raise fails
         return {"done": 1}
 
-    monkeypatch.setattr(worker, "work", work)
+    monkeypatch.setattr(rent, "work", work)
     monkeypatch.setattr(rent.sys, "argv", ["-c", "/run", "s", "2.0", "sha"])
     rent.hired()
     assert seen == [("/run", {"starter": "s", "every": 2.0, "patience": 24.0, "trust": "sha"})]
@@ -992,16 +992,13 @@ def test_the_answer_to_a_log_has_what_is_followed_over_time(monkeypatch: pytest.
 
 
 def test_a_log_of_the_machine_is_diagnosed_with_the_run_s_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    import hil.logs
-    import vaneloop.verbs.machine
-    import vaneloop.verbs.search
 
     seen: list[Any] = []
     log = SimpleNamespace(channels={"n": SimpleNamespace(t="T", values="V")})
-    monkeypatch.setattr(hil.logs, "read_log", lambda path, **more: seen.append((path, more)) or log)
-    monkeypatch.setattr(vaneloop.verbs.machine, "files_of", lambda tables: f"files of {tables}")
-    monkeypatch.setattr(vaneloop.verbs.machine, "Machine", lambda **of: of)
-    monkeypatch.setattr(vaneloop.verbs.search, "diagnose", lambda log, machine, workers: (machine, workers))
+    monkeypatch.setattr(diagnosis, "read_log", lambda path, **more: seen.append((path, more)) or log)
+    monkeypatch.setattr(diagnosis, "files_of", lambda tables: f"files of {tables}")
+    monkeypatch.setattr(diagnosis, "Machine", lambda **of: of)
+    monkeypatch.setattr(diagnosis, "diagnose", lambda log, machine, workers: (machine, workers))
     files = {"tables": "t", "model": "m", "plant": "p", "controller": "c", "dbc": "d"}
     machine = {"tables": "t", "model": "m", "table": "p", "controller": "c"}
     assert diagnosis._of_machine("/log", files, {"x": 1}) == ((machine, 1), {"n": ("T", "V")})
@@ -1014,16 +1011,14 @@ def test_a_log_of_a_system_of_one_s_own_is_read_as_the_system_reads(
     monkeypatch: pytest.MonkeyPatch, reads_itself: bool
 ) -> None:
     import vaneloop.identification
-    import vaneloop.identification.user_models.by_log
-    import vaneloop.verbs.search
 
     seen: list[Any] = []
     system = SimpleNamespace(read=reads_itself)
     record = SimpleNamespace(t="T", columns={"a": np.array([np.nan, 1.0]), "b": np.array([np.nan, np.nan])})
-    monkeypatch.setattr(vaneloop.identification, "load_system", lambda file: system if file == "s" else None)
-    monkeypatch.setattr(vaneloop.identification.user_models.by_log, "load_model_of", lambda file, system: f"of {file}")
-    monkeypatch.setattr(vaneloop.verbs.search, "read_record", lambda *a, **k: seen.append((a, k)) or (record, None))
-    monkeypatch.setattr(vaneloop.verbs.search, "diagnose", lambda record, system, added: ("said", added))
+    monkeypatch.setattr(diagnosis, "load_system", lambda file: system if file == "s" else None)
+    monkeypatch.setattr(diagnosis, "load_model_of", lambda file, system: f"of {file}")
+    monkeypatch.setattr(diagnosis, "read_record", lambda *a, **k: seen.append((a, k)) or (record, None))
+    monkeypatch.setattr(diagnosis, "diagnose", lambda record, system, added: ("said", added))
     found, columns = diagnosis._of_system("/log", {"system": "s", "model": "m"}, {"x": 1})
     assert found == ("said", "of m") and list(columns) == ["a"] and columns["a"][0] == "T"
     assert seen == [(("/log", system), {} if reads_itself else {"x": 1})]
@@ -1032,14 +1027,12 @@ def test_a_log_of_a_system_of_one_s_own_is_read_as_the_system_reads(
     def fails(*_: Any, **__: Any) -> None:
         raise vaneloop.identification.StageError("no column a")
 
-    monkeypatch.setattr(vaneloop.verbs.search, "diagnose", fails)
+    monkeypatch.setattr(diagnosis, "diagnose", fails)
     with pytest.raises(InputError, match="^no column a$"):
         diagnosis._of_system("/log", {"system": "s"}, {})
 
 
 def test_warming_up_diagnoses_a_short_run_of_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    import hil.loop.lockstep
-    import vaneloop.verbs.search
 
     seen: list[Any] = []
     machine = SimpleNamespace(calibration="K", plant="P")
@@ -1049,9 +1042,9 @@ def test_warming_up_diagnoses_a_short_run_of_the_machine(monkeypatch: pytest.Mon
         seen.append(more | {"of": stimulus})
         return SimpleNamespace(t=np.arange(3.0), columns={"t": np.arange(3.0), "n": np.ones(3)})
 
-    monkeypatch.setattr(hil.loop.lockstep, "lockstep", lockstep)
-    monkeypatch.setattr(hil.loop.lockstep, "Stimulus", SimpleNamespace(of=lambda n_dem: n_dem.tolist()))
-    monkeypatch.setattr(vaneloop.verbs.search, "diagnose", lambda log, m, workers: seen.append((log, m, workers)))
+    monkeypatch.setattr(diagnosis, "lockstep", lockstep)
+    monkeypatch.setattr(diagnosis, "Stimulus", SimpleNamespace(of=lambda n_dem: n_dem.tolist()))
+    monkeypatch.setattr(diagnosis, "diagnose", lambda log, m, workers: seen.append((log, m, workers)))
     diagnosis.diagnose_log.warm_up({"files": {"model": "machine/m.toml"}}, "/run")
     files, more, (log, of, workers) = seen
     assert files == {"model": "/run/machine/m.toml"} and of is machine and workers == 1

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 
 from plant.model import text_of
 from vaneloop.base.errors import InputError
@@ -115,9 +116,7 @@ def _rows(folder: Folder, g: Group, pattern: str = "[0-9]*.json") -> dict[str, d
 
 def interval(failed: int, n: int, confidence: float) -> tuple[float, float]:
     """Clopper-Pearson's interval of a failure probability from ``failed`` of ``n`` trials."""
-    from scipy.stats import binomtest
-
-    found = binomtest(failed, n).proportion_ci(confidence, method="exact")
+    found = scipy.stats.binomtest(failed, n).proportion_ci(confidence, method="exact")
     return float(found.low), float(found.high)
 
 
@@ -230,8 +229,6 @@ def _indices(
     """First-order and total Sobol index of each quantity for the least margin; empty: none was asked for, or the margin
     does not vary.
     """
-    from scipy.stats import sobol_indices
-
     n, d = plan.sensitivity, len(quantities)
     if not n:
         return [], []
@@ -244,5 +241,5 @@ def _indices(
     ab = np.array([[shares(f"ab{k:03d}-{i:06d}" for i in range(n))] for k in range(d)])
     if not (np.isfinite(a).all() and np.isfinite(b).all() and np.isfinite(ab).all()) or np.ptp([a, b]) == 0.0:
         return [], []
-    found = sobol_indices(func={"f_A": a, "f_B": b, "f_AB": ab}, n=n)
+    found = scipy.stats.sobol_indices(func={"f_A": a, "f_B": b, "f_AB": ab}, n=n)
     return np.ravel(found.first_order).tolist(), np.ravel(found.total_order).tolist()

@@ -7,10 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hil.logs import Channel, Log, read_log
+from hil.loop.lockstep import Stimulus, lockstep
 from vaneloop.base.errors import InputError
+from vaneloop.identification import StageError, load_system
+from vaneloop.identification.user_models.by_log import load_model_of
+from vaneloop.verbs.machine import Machine, files_of
+from vaneloop.verbs.search import diagnose, read_record
 
 if TYPE_CHECKING:
-    from vaneloop.verbs.machine import Machine
     from vaneloop.verbs.search import Diagnosed
 
     Columns = dict[str, tuple[np.ndarray, np.ndarray]]
@@ -38,10 +43,6 @@ def diagnose_log(path: str, options: dict[str, Any], run: str) -> dict[str, Any]
 
 def _of_machine(path: str, files: dict[str, str], reading: dict[str, Any]) -> tuple[Diagnosed, Columns]:
     """The answer to a log of the vane machine, and times and values of its channels."""
-    from hil.logs import read_log
-    from vaneloop.verbs.machine import files_of
-    from vaneloop.verbs.search import diagnose
-
     log = read_log(path, require=(), **reading, tables=files_of(files.get("tables")))
     said = diagnose(log, _machine(files), workers=1)
     return said, {name: (c.t, c.values) for name, c in log.channels.items()}
@@ -49,10 +50,6 @@ def _of_machine(path: str, files: dict[str, str], reading: dict[str, Any]) -> tu
 
 def _of_system(path: str, files: dict[str, str], reading: dict[str, Any]) -> tuple[Diagnosed, Columns]:
     """The same of a user's own system, with what its model file has learned by now."""
-    from vaneloop.identification import StageError, load_system
-    from vaneloop.identification.user_models.by_log import load_model_of
-    from vaneloop.verbs.search import diagnose, read_record
-
     try:
         system = load_system(files["system"])
         added = load_model_of(files["model"], system) if "model" in files else None
@@ -65,8 +62,6 @@ def _of_system(path: str, files: dict[str, str], reading: dict[str, Any]) -> tup
 
 
 def _machine(files: dict[str, str]) -> Machine:
-    from vaneloop.verbs.machine import Machine
-
     given = {"tables": "tables", "model": "model", "table": "plant", "controller": "controller"}
     return Machine(**{argument: files[name] for argument, name in given.items() if name in files})
 
@@ -112,10 +107,6 @@ def _warm_up(options: dict[str, Any], run: str) -> None:
     """Compile all that a diagnosis needs, on a short simulated run; of a user's own system with its first log."""
     if "system" in options["files"]:
         return
-    from hil.logs import Channel, Log
-    from hil.loop.lockstep import Stimulus, lockstep
-    from vaneloop.verbs.search import diagnose
-
     machine = _machine({name: str(Path(run) / f) for name, f in options["files"].items()})
     n_dem = np.repeat([60.0, 90.0, 70.0, 95.0], 1000)
     simulated = lockstep(Stimulus.of(n_dem), calibration=machine.calibration, plant=machine.plant, seed=1, every=10)

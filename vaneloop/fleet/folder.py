@@ -25,6 +25,7 @@ import os
 import re
 import shutil
 import stat
+import tempfile
 import time
 import uuid
 from collections.abc import Iterator, Sequence, Set
@@ -32,17 +33,18 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from vaneloop.base import tables
 from vaneloop.base.errors import InputError
 from vaneloop.fleet.files import create, digest_of, passed, plain_file, read_json, reason_of, whole
 from vaneloop.fleet.kinds import TRIAL
 from vaneloop.fleet.sources import Source
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 __all__ = ["STATUSES", "Entry", "Folder", "copies_of", "key_of", "sources_version"]
 
@@ -103,8 +105,6 @@ def sources_version() -> str:
     """VaneLoop's version and a digest of the sources, tables and numba's version from which a result follows: results
     of other code do not belong beside these.
     """
-    from importlib.metadata import PackageNotFoundError, version
-
     try:
         number = version("vaneloop")
     except PackageNotFoundError:
@@ -230,9 +230,6 @@ class Folder:
 
     def table(self, file: Path, schema: pa.Schema) -> pa.Table | None:
         """A Parquet file of the run with these columns; None: it is damaged, which is noted."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
         try:
             with open(plain_file(file), "rb") as f:
                 opened = pq.ParquetFile(f)
@@ -279,9 +276,6 @@ class Folder:
         in_chunk  logs in a chunk (default: few logs, small chunks)
         again     keys that are to be done once more
         """
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
         while True:
             batch = max(self._batches(), default=-1) + 1  # what comes while the logs are looked at has this number
             before = list(self._rows())
@@ -343,9 +337,6 @@ class Folder:
 
     def close(self, chunk: str, entries: Sequence[Entry]) -> bool:
         """Put the results of a chunk into its part, and clear its files away; False: a result is missing."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
         if chunk in self.finished():
             return True
         rows = []
@@ -490,14 +481,10 @@ def _is_result(row: Any, key: str) -> bool:
 
 
 def _part_schema(columns: Sequence[str] = _COLUMNS) -> Any:
-    import pyarrow as pa
-
     return pa.schema([(c, pa.string()) for c in columns])
 
 
 def _schema() -> Any:
-    import pyarrow as pa
-
     text, number = pa.string(), pa.int64()
     return pa.schema([
         ("path", text), ("key", text), ("size", number), ("mtime_ns", number), ("chunk", text), ("engine", text),
@@ -554,8 +541,6 @@ def _digest_of_all(files: dict[str, str]) -> str:
 
 def _copy(files: dict[str, str], to: Path) -> None:
     """Copy files and folders, all at once: of two starters one is the first."""
-    import tempfile
-
     to.parent.mkdir(parents=True, exist_ok=True)
     made = Path(tempfile.mkdtemp(prefix=".machine-", dir=to.parent))
     try:

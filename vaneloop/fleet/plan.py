@@ -30,12 +30,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import scipy
 from pydantic import Field, field_validator, model_validator
 
 from hil.inject.actions import Replay
 from hil.inject.scenario import Scenario, library, load_scenario
 from plant import Model, Plant, load_model
 from plant.effects import EFFECTS
+from vaneloop.base import tables
 from vaneloop.base.errors import InputError, meant
 from vaneloop.base.tables import Finite, Table, read
 from vaneloop.verbs.machine import Machine
@@ -184,8 +186,6 @@ def groups(plan: Plan) -> Iterator[Group]:
 
 def files_of_plan(plan: Plan) -> dict[str, str]:
     """Files that trials need, by the names under which a run keeps copies."""
-    from vaneloop.base import tables
-
     known = library()
     files = {f"scenario.{Path(s).stem}": str(known.get(s, s)) for s in plan.scenarios}
     files |= {f"tables.{c.name}": c.tables for c in plan.calibration if c.tables}
@@ -257,10 +257,8 @@ def draw(plan: Plan, dimensions: int) -> tuple[np.ndarray, np.ndarray]:
     One sequence of twice the dimensions gives both, so that the first ``sensitivity`` samples are the indices' first
     set and are run once.
     """
-    from scipy.stats import qmc
-
     if plan.sampling == "sobol":
-        both = qmc.Sobol(2 * dimensions, scramble=True, seed=plan.seed).random(plan.samples)
+        both = scipy.stats.qmc.Sobol(2 * dimensions, scramble=True, seed=plan.seed).random(plan.samples)
     else:
         both = np.random.default_rng(plan.seed).random((plan.samples, 2 * dimensions))
     return both[:, :dimensions], both[: plan.sensitivity, dimensions:]

@@ -7,6 +7,7 @@ print goes to standard error. It ends when its worker ends.
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import fcntl
 import importlib
 import json
@@ -22,8 +23,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from numba import config
+
 from vaneloop.base import terminal
 from vaneloop.base.child import python
+from vaneloop.base.compiled import cache_folder, sources_digest
 from vaneloop.base.errors import InputError
 from vaneloop.fleet.kinds import KINDS
 
@@ -148,16 +152,12 @@ class Reader:
 
 def _environment() -> dict[str, str]:
     """Environment of the process: one thread, and a cache of compiled code that no other host or version shares."""
-    from vaneloop.base.compiled import cache_folder
-
     own = {"NUMBA_CACHE_DIR": f"{cache_folder()}-{socket.gethostname()}"}
     return {**own, **os.environ, **ONE_THREAD}
 
 
 def serve() -> None:
     """Answer for one log after the other until standard input ends. The words: kind, run folder."""
-    import faulthandler
-
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     faulthandler.enable()
@@ -187,10 +187,6 @@ def _warm_up(function: Callable[..., object] | None, options: dict[str, Any], ru
     """
     if function is None:
         return
-    from numba import config
-
-    from vaneloop.base.compiled import sources_digest
-
     cache = Path(config.CACHE_DIR)  # type: ignore[attr-defined]
     cache.mkdir(parents=True, exist_ok=True)
     warm = cache / f"fleet-{function.__module__}-{sources_digest()}.warm"

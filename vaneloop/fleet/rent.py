@@ -23,6 +23,7 @@ from vaneloop.base.errors import InputError, meant
 from vaneloop.base.extras import needed, needs
 from vaneloop.fleet.folder import Folder
 from vaneloop.fleet.leases import BEATS, Me
+from vaneloop.fleet.worker import work
 
 __all__ = ["PLACES", "hired", "known", "rent"]
 
@@ -214,6 +215,4 @@ def _cluster(on: str, workers: int, queue: dict[str, str], run: str) -> Any:
 
 def _work(run: str, starter: str, every: float, trust: str) -> dict[str, int]:
     """Work on the run, in a process of the cluster."""
-    from vaneloop.fleet.worker import work
-
     return work(run, starter=starter, every=every, patience=BEATS * every, trust=trust)

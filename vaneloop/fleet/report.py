@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
 from scipy import stats
 
 from vaneloop.base.errors import InputError
 from vaneloop.fleet.sources import text_table
 from vaneloop.fleet.trends import ODD, SURE, Trend, limit_of, odd, trend
-from vaneloop.pages.fleet import YEAR, FleetView, Series
+from vaneloop.pages.fleet import YEAR, FleetView, Series, log_page
 
 if TYPE_CHECKING:
     import duckdb
@@ -309,8 +310,6 @@ def _known(db: duckdb.DuckDBPyConnection) -> set[str]:
 
 def _store(db: duckdb.DuckDBPyConnection, table: str, rows: list[dict[str, Any]]) -> None:
     """Keep rows as a table of the database, to be written with the others."""
-    import pyarrow as pa
-
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {n: [row.get(n) for row in rows] for n in names} or {"engine": pa.array([], pa.string())}
     db.register("_rows", pa.table(columns))
@@ -320,8 +319,6 @@ def _store(db: duckdb.DuckDBPyConnection, table: str, rows: list[dict[str, Any]]
 
 def write_pages(folder: Path, said: dict[str, dict[str, Any]]) -> None:
     """Write the page of each log that the fleet's page leads to."""
-    from vaneloop.pages.fleet import log_page
-
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from hil.logs.formats import format_of, suffixes
+import pyarrow as pa
+import pyarrow.parquet as pq
+
 from vaneloop.base.cells import unmarked
 from vaneloop.base.errors import InputError
 

@@ -17,6 +17,9 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import pyarrow as pa
+import pyarrow.compute as pc
+
 from vaneloop.base.cells import FORMULA
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import whole
@@ -25,7 +28,6 @@ from vaneloop.fleet.folder import KEY, STATUSES, Folder
 
 if TYPE_CHECKING:
     import duckdb
-    import pyarrow as pa
 
 __all__ = ["TABLES", "answers", "damaged", "database", "roll_up", "write_tables"]
 
@@ -66,8 +68,6 @@ def roll_up(folder: Folder) -> duckdb.DuckDBPyConnection:
         )
     if not folder.finished():
         raise InputError(f"{folder.path}: no part of the run is finished yet; vaneloop fleet status says how far it is")
-    import pyarrow as pa
-
     db = database()
     entries = folder.entries()
     text = {n: pa.array([getattr(e, n) for e in entries], pa.string()) for n in ("path", "key", "engine", "reason")}
@@ -116,8 +116,6 @@ def _columns(shape: str) -> str:
 
 def _batches(folder: Folder) -> Iterator[pa.Table]:
     """What came of all logs, each content once, as the latest row has it; some `TAKEN` bytes at a time."""
-    import pyarrow as pa
-
     held: list[pa.Table] = []
     size, seen = 0, set[str]()
     for table in folder.parts("key", "status", "reason", "verdict", "answer"):
@@ -180,9 +178,6 @@ def database() -> duckdb.DuckDBPyConnection:
 
 def answers(folder: Folder, keys: list[str]) -> dict[str, dict[str, Any]]:
     """The answers to some logs by their keys, as ``vaneloop diagnose --json`` gives them; damaged ones are left out."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
     wanted, found = pa.array(keys, pa.string()), {}
     for table in folder.parts("key", "answer"):
         for row in reversed(table.filter(pc.is_in(table["key"], wanted)).to_pylist()):

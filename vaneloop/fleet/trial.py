@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import scipy
 from pydantic import BaseModel, Field, ValidationError
 
 from hil.inject.any_controller import SHIPPED, expected_of_any, load_reactions
@@ -19,6 +20,7 @@ from hil.inject.injection import run
 from hil.inject.margin import margins
 from hil.inject.scenario import Scenario
 from hil.inject.verdict import Outcome
+from hil.loop.lockstep import warm_up
 from plant import Model
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Finite, Table
@@ -155,8 +157,6 @@ def _search(
 
     The first two have half of the runs, the simplex the other half. The same file gives the same runs.
     """
-    from scipy import optimize
-
     seen = {tuple(point): float(share) for point, share in asked["known"]}
     start = sorted(seen, key=lambda point: (seen[point], point))
     best: list[Any] = [np.inf, None]
@@ -184,7 +184,7 @@ def _search(
         corner = np.where(slope > 0.0, 0.0, 1.0)
         if least(corner) < seen[start[-1]]:
             first[-1] = corner
-        optimize.differential_evolution(
+        scipy.optimize.differential_evolution(
             least, box, init=first, maxiter=10_000, tol=0.0, atol=-1.0, polish=False, rng=np.random.default_rng(seed)
         )
     except _Spent:
@@ -193,7 +193,7 @@ def _search(
         most = asked["search"]
         at = np.array(min(seen, key=lambda point: (seen[point], point)))
         corners = at + np.where(at < 0.5, 0.15, -0.15) * np.eye(len(at))
-        optimize.minimize(
+        scipy.optimize.minimize(
             least, at, method="Nelder-Mead", bounds=box,
             options={"initial_simplex": np.vstack([at, corners]), "maxfev": 100_000, "xatol": 1e-4, "fatol": 1e-6},
         )  # fmt: skip
@@ -205,8 +205,6 @@ def _search(
 
 def _warm_up(options: dict[str, Any], run_folder: str) -> None:
     """Compile what a scenario needs."""
-    from hil.loop.lockstep import warm_up
-
     warm_up(lambda text: None)
     run(Scenario(title="warm-up", duration=0.1))
 

@@ -20,7 +20,7 @@ from vaneloop.identification.unmodelled.spectral_lines import Course, Lines, per
 from vaneloop.identification.user_models.exogenous_regressors import TIME
 
 if TYPE_CHECKING:
-    from vaneloop.identification.least_squares.problem import Fit
+    from vaneloop.identification.unmodelled.learning import Learner
 
 __all__ = ["SCREENED", "Step", "best_step", "screened", "smoothed", "starts_of"]
 

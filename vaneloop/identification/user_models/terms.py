@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,9 +27,6 @@ from vaneloop.identification.subsystem import Array
 from vaneloop.identification.user_models.data import Data
 from vaneloop.identification.user_models.exogenous_regressors import MINUS
 from vaneloop.identification.user_models.hysteresis_regressors import STOPS, of_stops
-
-if TYPE_CHECKING:
-    from vaneloop.identification.user_models.data import Data
 
 __all__ = [
     "COLUMN",
