@@ -42,7 +42,8 @@ def block(
 def compiled_text(source: str, space: dict[str, Any]) -> Callable[..., Any]:
     """Compiled function ``f`` of a text of Python, inlined where it is called; ``space``: names that the text uses."""
     exec(source, space)  # noqa: S102
-    out: Callable[..., Any] = njit(error_model="numpy", forceinline=True, no_cfunc_wrapper=True)(space["f"])
+    options: dict[str, Any] = {"error_model": "numpy", "forceinline": True, "no_cfunc_wrapper": True}
+    out: Callable[..., Any] = njit(**options)(space["f"])
     return called_by_code(out)
 
 

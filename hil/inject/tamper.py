@@ -32,7 +32,7 @@ from hil.inject.actions import (
     identifier,
     raw_signal,
 )
-from hil.logs.log import FORMATS
+from hil.logs.formats import format_of
 from vaneloop.base.errors import InputError
 
 __all__ = ["Gateway", "Intruder", "tick_of"]

@@ -11,9 +11,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
+from hil.logs.formats import format_of, suffixes
 from vaneloop.base.cells import unmarked
 from vaneloop.base.errors import InputError
 

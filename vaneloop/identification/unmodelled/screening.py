@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate,
 from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.unmodelled.spectral_lines import Course, Lines, periods_along
 from vaneloop.identification.user_models.exogenous_regressors import TIME
-
-if TYPE_CHECKING:
-    from vaneloop.identification.unmodelled.learning import Learner
 
 __all__ = ["SCREENED", "Step", "best_step", "screened", "smoothed", "starts_of"]
 
