@@ -121,7 +121,7 @@ SMALLER = {"--frames 10000000": "--frames 20000", "--logs 40": "--logs 1 --durat
            "--logs 60": "--logs 1 --duration 60",
            "--out out/motor.parquet": "--out out/motor.parquet --logs 1 --duration 60"}  # fmt: skip
 # commands whose examples take long
-LONG = {"strategies", "design", "spatial", "clearance", "experiment", "diagnose", "hidden-effect", "engine-test"}
+LONG = {"strategies", "design", "spatial", "clearance", "experiment", "diagnose", "engine-test"}
 LONG_EXAMPLES = {"inject --all", "schedule --geometry", "engine-test --tables", "export-fmu --part controller"}
 
 

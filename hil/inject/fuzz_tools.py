@@ -27,9 +27,8 @@ from hil.calibrate.slave import Slave, key_of
 from hil.calibrate.station import MASTER, MOST_WAITING, MOST_WORK, Attended, XcpService, data_of, row_of
 from hil.inject.tool_rules import Tool, in_frames, rules_of
 from hil.loop.node import Ecu, Node
-from hil.uds.server import Server
+from hil.uds.server import FUNCTIONAL, REQUEST, Server
 from hil.uds.server import key_of as uds_key
-from hil.uds.station import FUNCTIONAL, REQUEST, UdsService
 
 __all__ = ["ToolCampaign", "fuzz_tools"]
 
@@ -81,6 +80,8 @@ class _Target:
             self.services.append(XcpService(self.slave))
         if protocol != "xcp":
             self.server = Server(self.memory, seed=seed)
+            from hil.uds.station import UdsService  # the extra `diagnostics`
+
             self.services.append(UdsService(self.server))
         self.service = self.services[0]
         self.attended = Attended(self.node, *self.services)

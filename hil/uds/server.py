@@ -24,8 +24,9 @@ from hil.calibrate.prepare import Task
 from hil.uds import routines
 from hil.uds.trouble import CODES, MASK, TroubleMemory
 
-__all__ = ["MOST_REQUEST", "SIGNALS", "Server", "key_of"]
+__all__ = ["FUNCTIONAL", "MOST_REQUEST", "REQUEST", "RESPONSE", "SIGNALS", "Server", "key_of"]
 
+REQUEST, RESPONSE, FUNCTIONAL = 0x7E0, 0x7E8, 0x7DF  # CAN identifiers
 DEFAULT, PROGRAMMING, EXTENDED = 1, 2, 3
 S3, P2, P2_STAR = 5000, 50, 5000  # ticks
 MOST_FILE, BLOCK = 1 << 16, 256  # bytes of a calibration file, of a block with its two bytes of head

@@ -13,11 +13,10 @@ from isotp.tools import Timer
 from hil.calibrate.lock import Lock
 from hil.calibrate.memory import Memory
 from hil.calibrate.station import row_of
-from hil.uds.server import MOST_REQUEST, Server
+from hil.uds.server import FUNCTIONAL, MOST_REQUEST, REQUEST, RESPONSE, Server
 
 __all__ = ["FUNCTIONAL", "REQUEST", "RESPONSE", "UdsService"]
 
-REQUEST, RESPONSE, FUNCTIONAL = 0x7E0, 0x7E8, 0x7DF  # CAN identifiers
 MOST_WAITING = 64  # frames kept, and frames to send beyond which no further one is worked on
 MOST_ANSWERS = 16  # kept while the tool does not take the ones before
 WORK = 2  # of a tick's work (`hil.calibrate.station.MOST_WORK`), a frame with its request

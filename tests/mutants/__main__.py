@@ -86,7 +86,9 @@ NEAREST = {
         "curve_lanes spatial fmu"
     ),
     "plant.stages": "stages_spec curve_lanes same_answer lanes effects machines electromechanical loggers",
-    "hil": "hil_spec replay held figures page reading lockstep strategies schedule campaign",
+    **dict.fromkeys(
+        ("hil", "hil.replay"), "hil_spec replay held figures page reading lockstep strategies schedule campaign"
+    ),
     "hil.bus": "bus_spec bus_port_spec bus_lockstep_spec bus frames wire loop moments realtime node uds",
     "hil.logs": (
         "logs logs_frames_spec logs_names_spec logs_record_spec logs_tables_spec loggers reading readings guess held "
