@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 # Targets share one environment, and what takes long uses the cores itself.
 .NOTPARALLEL:
-.PHONY: help demo test test-all test-short test-pythons test-can mutants bench pictures docs lint clean compiled
+.PHONY: help demo test test-all test-short test-pythons test-can mutants bench pictures docs release lint clean compiled
 
 # `make test PYTHON=python3.13`: another Python, in an environment of its own. Without it, the first that fits.
 PYTHON :=
@@ -34,6 +34,7 @@ READY := $(VENV)/.ready-test
 READY_ALL := $(VENV)/.ready-test-all
 READY_DOCS := $(VENV)/.ready-docs
 READY_BENCH := $(VENV)/.ready-bench
+READY_RELEASE := $(VENV)/.ready-release
 ifneq ($(shell cat $(HOME_OF_VENV) 2>/dev/null && $(PY) -c '' 2>/dev/null && echo works),$(CURDIR) works)
   $(shell rm -f $(HOME_OF_VENV) $(VENV)/.ready-*)
 endif
@@ -81,6 +82,9 @@ pictures: $(READY_ALL)  ## take the pictures of the README anew (docs/pictures/w
 docs: $(READY_DOCS)  ## the documentation site, in out/site/index.html; every link and anchor is checked
 	@NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
 	@$(SAY) 'open out/site/index.html'
+
+release: $(READY_RELEASE)  ## wheel and source archive, in dist/; both are tried in an empty environment
+	@$(PY) -m tests.release
 
 lint: $(READY)  ## ruff, mypy, and what the packages allow that are brought in
 	@$(ruff)

@@ -37,7 +37,7 @@ ALLOWED = {
 }
 # Allowed to developers alone: no user's install brings them.
 DEVELOPERS = {"scapy": "GPL-2.0-only: checks frames of ours in a test; nothing that is given away has it in it"}
-DEVELOPERS_EXTRAS = {"test", "test-all", "docs", "bench"}
+DEVELOPERS_EXTRAS = {"test", "test-all", "docs", "bench", "release"}
 # What these say nowhere but in the text of their licence, or cannot say in a classifier.
 READ = {
     "fmpy": "BSD-2-Clause",

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
+
+import vaneloop
+from tests.release import contents, differing
+from vaneloop.base.version import installed_version
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("controller", "plant", "hil", "vaneloop")
@@ -37,3 +43,23 @@ def test_every_module_imports(package: str) -> None:
     assert done.returncode == 0, done.stderr
     told = done.stdout.splitlines()
     assert len(told) > 2 and sum(" needs " in line for line in told) < len(told) / 2, told
+
+
+def test_the_version_is_that_of_the_project_wherever_it_is_told() -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert f"\n## [{version}] " in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert f"Version {version} " in (ROOT / "README.md").read_text(encoding="utf-8")
+    assert vaneloop.__version__ == installed_version() and "__version__" in dir(vaneloop)
+    command = [sys.executable, "-m", "vaneloop", "--version"]
+    told = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT).stdout
+    assert told == f"vaneloop {vaneloop.__version__}\n"
+
+
+def test_wheels_differ_in_what_one_lacks_or_has_otherwise(tmp_path: Path) -> None:
+    made = []
+    for name, files in (("a.whl", {"x": "1", "y": "2"}), ("b.whl", {"x": "1", "y": "3", "z": ""})):
+        with zipfile.ZipFile(tmp_path / name, "w") as archive:
+            for file, text in files.items():
+                archive.writestr(file, text)
+        made.append(contents(tmp_path / name))
+    assert differing(*made) == ["y", "z"] == differing(*reversed(made)) and differing(made[0], made[0]) == []

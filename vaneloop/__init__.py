@@ -56,6 +56,9 @@ _HOME = {
     "write_log": "hil.logs",
 }
 
+if TYPE_CHECKING:
+    __version__: str  # of the installed package
+
 __all__ = [
     "Channel",
     "InputError",
@@ -85,9 +88,11 @@ def __getattr__(name: str) -> Any:
     """Import what is asked for when it is asked for: ``vaneloop --help`` must not wait for numpy and numba."""
     if name in _HOME:
         return getattr(importlib.import_module(_HOME[name]), name)
+    if name == "__version__":
+        return importlib.import_module("vaneloop.base.version").installed_version()
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
     """Names that a notebook offers on Tab."""
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, "__version__"})

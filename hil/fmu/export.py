@@ -8,7 +8,6 @@ import shutil
 import tempfile
 import zipfile
 from dataclasses import dataclass
-from importlib.metadata import version as release_of
 from pathlib import Path
 
 from controller import Calibration
@@ -20,6 +19,7 @@ from hil.fmu.variables import PARTS, Variable, variables_of
 from plant import Model, Plant
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import whole
+from vaneloop.base.version import installed_version
 
 __all__ = ["VERSIONS", "Written", "is_made", "write_fmu"]
 
@@ -82,7 +82,7 @@ def write_fmu(
     for name in ("fmu.h", *SOURCES[version], *_HEADERS[version]):
         if name not in files:
             files[name] = (SHELL / name).read_text(encoding="utf-8")
-    described = model_description(version, f"VaneLoop {part}", identifier, token, variables, release_of("vaneloop"))
+    described = model_description(version, f"VaneLoop {part}", identifier, token, variables, installed_version())
     binary = _built(files, SOURCES[version], part_object(part, shape))
     where = f"{platform.machine()}-linux" if version == "3.0" else "linux64"
     with whole(out) as made, zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:

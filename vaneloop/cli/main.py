@@ -99,9 +99,9 @@ def _main(argv: list[str]) -> int:
         print(_HELP)
         return 0 if argv else 2
     if argv[0] == "--version":
-        from importlib.metadata import version
+        from vaneloop.base.version import installed_version
 
-        print(f"vaneloop {version('vaneloop')}")
+        print(f"vaneloop {installed_version()}")
         return 0
     name = argv[0]
     if (gone := next((w for w in (name, " ".join(argv[:2])) if w in IN_CHECKOUT), None)) is not None:

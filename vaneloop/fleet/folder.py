@@ -33,7 +33,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
-from importlib.metadata import PackageNotFoundError, version
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,7 @@ import pyarrow.parquet as pq
 
 from vaneloop.base import tables
 from vaneloop.base.errors import InputError
+from vaneloop.base.version import installed_version
 from vaneloop.fleet.files import create, digest_of, passed, plain_file, read_json, reason_of, whole
 from vaneloop.fleet.kinds import TRIAL
 from vaneloop.fleet.sources import Source
@@ -105,16 +106,12 @@ def sources_version() -> str:
     """VaneLoop's version and a digest of the sources, tables and numba's version from which a result follows: results
     of other code do not belong beside these.
     """
-    try:
-        number = version("vaneloop")
-    except PackageNotFoundError:
-        number = "0"
-    h = hashlib.sha256(version("numba").encode())
+    h = hashlib.sha256(metadata.version("numba").encode())
     kinds = (".py", ".toml", ".dbc", ".c", ".h")
     for place in (*(_ROOT / p for p in _SOURCES), tables.path("plant.toml").parent):
         for f in sorted(f for f in place.rglob("*.*") if f.suffix in kinds and "__pycache__" not in f.parts):
             h.update(f"{f.relative_to(place).as_posix()}:{digest_of(f)}\n".encode())
-    return f"{number}+{h.hexdigest()[:16]}"
+    return f"{installed_version()}+{h.hexdigest()[:16]}"
 
 
 class Folder:

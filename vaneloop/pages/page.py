@@ -19,13 +19,13 @@ import html
 import json
 import math
 from collections.abc import Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from vaneloop.base.files import write
+from vaneloop.base.version import installed_version
 from vaneloop.pages.figures import Figure
 from vaneloop.pages.style import THEMES, Tone, capital, number
 
@@ -220,10 +220,7 @@ def _tile(t: Tile) -> str:
 
 def _version() -> str:
     """Version of the installed distribution."""
-    try:
-        return "vaneloop " + version("vaneloop")
-    except PackageNotFoundError:
-        return "vaneloop (not installed)"
+    return f"vaneloop {installed_version('(not installed)')}"
 
 
 def _is_number(value: object) -> bool:
