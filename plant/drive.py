@@ -64,9 +64,25 @@ from plant.valve import valve_step
 from vaneloop.base.compiled import inlined
 
 __all__ = [
-    "Drive", "DriveState", "Feed", "Plays", "current", "feed", "flow_gain", "load_of", "prepare", "remembered", "rest",
-    "step", "stored", "taken", "told",
-]  # fmt: skip
+    "Drive",
+    "DriveState",
+    "Feed",
+    "Plays",
+    "current",
+    "feed",
+    "flow_gain",
+    "gains",
+    "half_share",
+    "load_of",
+    "prepare",
+    "remembered",
+    "rest",
+    "root",
+    "step",
+    "stored",
+    "taken",
+    "told",
+]
 
 
 class DriveState(NamedTuple):
@@ -254,10 +270,28 @@ def load_of(d: Any, n_r: float) -> float:
 
 
 @inlined
+def gains(d: Any, gain: float) -> tuple[float, float]:
+    """Return the flow gains (m/s) of extension and retraction, whose mean is ``gain``."""
+    return valve_gain_asymmetry.step(gain, d.valve_gain_asymmetry)
+
+
+@inlined
+def root(d: Any, p_s: float) -> float:
+    """Return the root of the supply's share ``p_s`` (Pa) of the pressure for which the flow gain holds."""
+    return speed_factor(p_s, 0.0, d.p_ref)
+
+
+@inlined
+def half_share(d: Any, p_s: float) -> float:
+    """Return half of what a newton on the piston is of the supply ``p_s`` (Pa), 1/N."""
+    return 0.5 * d.per_area / p_s
+
+
+@inlined
 def feed(d: Any, gain: float, load: float, p_s: float) -> Feed:
     """Return what is fed at the flow gain ``gain`` (m/s), the ``load`` (N) and the supply pressure ``p_s`` (Pa)."""
-    extending, retracting = valve_gain_asymmetry.step(gain, d.valve_gain_asymmetry)
-    return Feed(extending, retracting, speed_factor(p_s, 0.0, d.p_ref), load, 0.5 * d.per_area / p_s)
+    extending, retracting = gains(d, gain)
+    return Feed(extending, retracting, root(d, p_s), load, half_share(d, p_s))
 
 
 @inlined

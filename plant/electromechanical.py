@@ -97,6 +97,7 @@ __all__ = [
     "load_of",
     "load_torques",
     "prepare",
+    "rated_speed",
     "rest",
     "sense",
     "step",
@@ -135,7 +136,7 @@ class _Motor(NamedTuple):
     """What a step needs of the machine, worked out once; behind these fields those of the effects at amplifier, motor,
     screw and actuator (`plant.prepared`).
 
-    per_rated, rated                1/A, rad/s: command to speed demand
+    per_rated, bare_rated, rated    1/A, rad/s without and with the tacho's drift: command to speed demand
     lag_share, current_share        shares of the way that amplifier_lag and the current loop go in a step
     gain, rate                      A s/rad, A/rad: speed loop
     peak, voltage, per_ohm          A, V, 1/Ohm
@@ -149,6 +150,7 @@ class _Motor(NamedTuple):
     """
 
     per_rated: float
+    bare_rated: float
     rated: float
     lag_share: float
     current_share: float
@@ -174,11 +176,13 @@ class _Motor(NamedTuple):
 @inlined
 def _numbers(p: np.ndarray, j: int, temperature: float) -> _Motor:
     """Return what lane ``j`` of the parameters needs for its steps at ``temperature`` (degC), but for the effects' own
-    numbers."""
+    numbers.
+    """
     low, high = end_stop_shift.step(p[STROKE, j], p[END_STOP_SHIFT, j])
     r = p[SCREW_LEAD, j] / (2.0 * math.pi * p[GEAR_RATIO, j])
     return _Motor(
         1.0 / p[RATED_CURRENT, j],
+        p[RATED_SPEED, j] / r,
         tacho_thermal_drift.step(p[RATED_SPEED, j] / r, temperature, p[TACHO_THERMAL_DRIFT, j]),
         p[AMPLIFIER_SHARE, j],
         p[CURRENT_SHARE, j],
@@ -228,6 +232,12 @@ def stored(s: np.ndarray, j: int, z: MotorState) -> None:
     s[DEMANDED, j], s[SPEED_INTEGRAL, j], s[I_MOTOR, j], s[MOTOR_SPEED, j] = z.demanded, z.integral, z.i, z.w
     s[SPEED, j], s[AHEAD, j], s[BENT, j] = z.speed, z.ahead, z.bent
     s[X, j], s[X_LVDT, j], s[READING, j] = z.x, z.x_lvdt, z.reading
+
+
+@inlined
+def rated_speed(d: Any, temperature: float) -> float:
+    """Return the speed (rad/s) that the rated current asks for at ``temperature`` (degC): what is ``rated`` then."""
+    return tacho_thermal_drift.step(d.bare_rated, temperature, d.tacho_thermal_drift)
 
 
 @inlined

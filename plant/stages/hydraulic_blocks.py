@@ -43,7 +43,7 @@ BLOCK = lanes.block(W, drive.DriveState, drive.Drive, drive.Feed, drive.Plays, l
 _state, _put_state = lanes.getter(drive.DriveState), lanes.putter(drive.DriveState)
 _drive, _put_drive = lanes.getter(drive.Drive), lanes.putter(drive.Drive)
 _rated_drive = lanes.getter(drive.Drive, rated=1.0)  # for currents that are shares of the rated one
-_feed, _put_feed = lanes.getter(drive.Feed), lanes.putter(drive.Feed)
+_feed = lanes.getter(drive.Feed)
 _plays, _put_plays = lanes.getter(drive.Plays), lanes.putter(drive.Plays)
 _lvdt, _put_lvdt = lanes.getter(lvdt.Lvdt), lanes.putter(lvdt.Lvdt)
 
@@ -110,9 +110,21 @@ def run(
         for k in range(n):
             if k > 0:
                 supply, warm, speed = between(p_s, k), between(t_oil, k), between(n_r, k)
+                other = 0
                 for j in range(W):
-                    b.gain[j], b.bare_load[j] = drive.flow_gain(_drive(b, j), warm), drive.load_of(_drive(b, j), speed)
-                    _put_feed(b, j, drive.feed(_drive(b, j), b.gain[j], b.bare_load[j], supply))
+                    gain = drive.flow_gain(_drive(b, j), warm)
+                    other += gain != b.gain[j]
+                    b.gain[j] = gain
+                if other > 0 or k == 1:
+                    for j in range(W):
+                        b.extending[j], b.retracting[j] = drive.gains(_drive(b, j), b.gain[j])
+                if need[0]:
+                    for j in range(W):
+                        b.load[j] = b.bare_load[j] = drive.load_of(_drive(b, j), speed)
+                        b.half_share[j] = drive.half_share(_drive(b, j), supply)
+                else:
+                    for j in range(W):
+                        b.root[j] = drive.root(_drive(b, j), supply)
                 _go(way, b, current, k, rated, supply, h, p, first, known, tables, some)
             if first >= 0:
                 bend_reading(b, p, first, known, k, tables, some)
@@ -189,7 +201,7 @@ def _substeps(
     for m in range(current.shape[1]):
         i_cmd = current[k, m]
         if curved:
-            _bend(b, p, q, known, k, i_cmd, p_s, h, opens, tables, some)
+            _bend(b, p, q, known, k, i_cmd, h, opens, tables, some)
         share = valve_null_bias.step(i_cmd, 0.0) / rated
         for j in range(W):
             if not memory and not limited:  # all lanes have the same current: it is divided once
@@ -216,7 +228,6 @@ def _bend(
     known: np.ndarray,
     k: int,
     i_cmd: float,
-    p_s: float,
     h: float,
     opens: bool,
     tables: np.ndarray,
@@ -225,8 +236,8 @@ def _bend(
     """What curves give in a plant step under ``i_cmd`` (A); ``opens``: one of them acts on the lands of the valve."""
     bend_drive(b, p, q, known, k, i_cmd, tables, some)
     for j in range(W):
-        gain, load = b.gain[j] * curve.times(b.flow_times[j]), b.bare_load[j] + b.load_adds[j]
-        _put_feed(b, j, drive.feed(_drive(b, j), gain, load, p_s))
+        b.extending[j], b.retracting[j] = drive.gains(_drive(b, j), b.gain[j] * curve.times(b.flow_times[j]))
+        b.load[j] = b.bare_load[j] + b.load_adds[j]
         b.shut[j] = 0.0
     if opens:
         for j in range(W):

@@ -52,7 +52,7 @@ def run(
     b = block[0]
     for j0 in range(0, len(order), W):
         last = min(W, len(order) - j0)
-        swaying, prepared_at = False, t_oil[0]
+        swaying = False
         for j in range(W):
             q = order[j0 + min(j, last - 1)]
             swaying |= p[SCREW_PITCH_ERROR, q] != 0.0
@@ -64,11 +64,8 @@ def run(
         for k in range(n):
             if k > 0:
                 speed, warm = between(n_r, k), between(t_oil, k)
-                if warm != prepared_at:
-                    prepared_at = warm
-                    for j in range(W):
-                        _put_motor(b, j, electromechanical.prepare(p, order[j0 + min(j, last - 1)], warm))
                 for j in range(W):
+                    b.rated[j] = electromechanical.rated_speed(_motor(b, j), warm)
                     force = electromechanical.load_of(_motor(b, j), speed)
                     b.torque_of_load[j], b.most[j] = electromechanical.load_torques(_motor(b, j), force)
                 for m in range(substeps):
