@@ -60,7 +60,7 @@ def test_an_internal_error_of_any_command_leaves_with_70(
 def test_an_error_deep_inside_leaves_with_70(
     name: str, kept: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("hil.logs.read_log", broken)
+    monkeypatch.setattr("vaneloop.cli.options.read_log", broken)
     assert main([name, LOG, "--quiet"]) == 70
     assert "internal error" in complaint(capsys.readouterr().err)
 
@@ -106,7 +106,7 @@ def test_bad_input_is_no_defect(capsys: pytest.CaptureFixture[str]) -> None:
 MODULES = {
     "vaneloop": ("hil.logs.read_log", ["locate", LOG]),
     "vaneloop.cli.main": ("hil.logs.read_log", ["locate", LOG]),
-    "vaneloop.cli.ahead": ("vaneloop.base.kept.sources_digest", []),
+    "vaneloop.cli.ahead": ("hil.loop.lockstep.lockstep", ["simulator", "."]),
     "vaneloop.cli.demo": ("os.path.relpath", []),
     "vaneloop.web.worker": ("", ["not a number"]),
     "vaneloop.web.loop": ("", ["not a number"]),

@@ -32,9 +32,10 @@ from vaneloop.base import terminal
 from vaneloop.base.child import python
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path as shipped
+from vaneloop.cli import campaign, fleet
 from vaneloop.cli import options as cli_options
 from vaneloop.cli.main import main
-from vaneloop.fleet import folder, kinds, rent, worker
+from vaneloop.fleet import folder, kinds, worker
 from vaneloop.fleet.files import whole_json
 from vaneloop.fleet.folder import Folder
 from vaneloop.fleet.leases import Leases
@@ -85,7 +86,8 @@ def nearby(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     def rented(run: Folder, on: str, n: int, queue: Any, every: float, told: Any, trust: str = "") -> dict[str, int]:
         return work(run.path, every=every, patience=0.5, wait=False, trust=trust)
 
-    monkeypatch.setattr(rent, "rent", rented)
+    for command in (campaign, fleet):
+        monkeypatch.setattr(command, "rent", rented)
     yield
 
 

@@ -111,8 +111,8 @@ def rivals(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told = {"t": t, "n_dem": t, "table": [], "separates": True}
     page = Page("t", "v")
     answer = SimpleNamespace(recommended=told, to_dict=lambda: told, sentence=str, report=lambda p, _: page.write(p))
-    monkeypatch.setattr("vaneloop.verbs.search.diagnosed", lambda *_, **__: None)
-    monkeypatch.setattr("vaneloop.verbs.search.experiment", lambda *_, **__: answer)
+    monkeypatch.setattr("vaneloop.cli.experiment.diagnosed", lambda *_, **__: None)
+    monkeypatch.setattr("vaneloop.cli.experiment.recommend", lambda *_, **__: answer)
 
 
 def trials(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,7 +124,7 @@ def trials(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         monkeypatch.setattr(f"vaneloop.fleet.campaign.{name}", lambda *_, gives=gives: gives)
     monkeypatch.setattr("vaneloop.fleet.campaign.judge", lambda *_: campaign([group()]))
-    monkeypatch.setattr("vaneloop.fleet.plan.load_plan", lambda _: SimpleNamespace(firmware=[]))
+    monkeypatch.setattr("vaneloop.cli.campaign.load_plan", lambda _: SimpleNamespace(firmware=[]))
     for name in ("_work", "_show", "tell_damaged"):
         monkeypatch.setattr(f"vaneloop.cli.campaign.{name}", lambda *_: None)
 
@@ -419,7 +419,7 @@ def test_rows_of_a_blind_benchmark(tmp_path: Path) -> None:
 
 
 def test_a_law_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vaneloop.identification.unmodelled.python_law.python_law", lambda *_: "def law(x): return x\n")
+    monkeypatch.setattr("vaneloop.verbs.learn.python_law", lambda *_: "def law(x): return x\n")
     found: Any = SimpleNamespace(laws=[None])
     (tmp_path / "l.py").write_bytes(OLD)
     kept_when_full(tmp_path, lambda: Learned.write_python(found, tmp_path / "l.py"))

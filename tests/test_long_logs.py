@@ -79,7 +79,7 @@ def test_errors_of_the_whole_log_are_those_of_one_piece(monkeypatch: pytest.Monk
     log = logs()[1]
     monkeypatch.setattr(long, "STRETCH", 4)
     monkeypatch.setattr(long, "LEAD", 10.0)
-    chain = long.excerpted(log, grid_of(log), machine(), 24_000)
+    chain = long.excerpted(log, grid_of(log), machine().stages_of, 24_000)
     whole = machine().stages_of(log, grid_of(log))
     fits = [(s.name, [s.neutral()], s.floor, np.inf) for s in chain.stages]
     held = long.held_against(chain, fits, workers=1)
@@ -97,7 +97,7 @@ def test_errors_of_the_whole_log_are_those_of_one_piece(monkeypatch: pytest.Monk
 def test_what_the_excerpt_has_not_seen_is_found_and_searched() -> None:
     """A dead band of one minute in ten, of which the excerpt has nothing at first."""
     log, laws = logs()[1], ("valve_dead_band", "valve_null_bias")
-    chain = long.excerpted(log, grid_of(log), machine(), 24_000)
+    chain = long.excerpted(log, grid_of(log), machine().stages_of, 24_000)
     chain = chain.whole.chain([k for k in chain.whole.chosen if k not in (2, 3, 4)])
     chain = long.changed(
         chain, lambda c: replace(c, stages=[remade(s, laws, ()) for s in c.stages if s.name == "actuator"])

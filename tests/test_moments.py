@@ -14,16 +14,14 @@ import numpy as np
 import pytest
 
 from controller import FAULTS, MODES
-from hil.bus import port
 from hil.inject.scenario import library, load_scenario
-from hil.loop import realtime
 from vaneloop.web import loop, moments
 from vaneloop.web.charts import Mark
 from vaneloop.web.jobs import Cancelled, Worker, WorkError
 from vaneloop.web.loop import COLUMNS
+from vaneloop.web.process import Inbox
 from vaneloop.web.running import ANY, MOST, Loop
 from vaneloop.web.session import LogFile, Session
-from vaneloop.web.worker import Inbox
 
 STALE = 1 << FAULTS.index("demand_stale")
 
@@ -127,8 +125,8 @@ def test_a_run_in_real_time_that_fails_hears_nothing_any_more(inbox: None, monke
     def fails(*_: Any, **__: Any) -> None:
         raise OSError("the bus is gone")
 
-    monkeypatch.setattr(port, "open_bus", lambda *_, **__: SimpleNamespace(read_rows=None, shutdown=lambda: None))
-    monkeypatch.setattr(realtime, "run_realtime", fails)
+    monkeypatch.setattr(loop, "open_bus", lambda *_, **__: SimpleNamespace(read_rows=None, shutdown=lambda: None))
+    monkeypatch.setattr(loop, "run_realtime", fails)
     before = set(threading.enumerate())
     with pytest.raises(OSError, match="gone"):
         loop._in_real_time(lambda *_: None, "local", SimpleNamespace(tick=lambda *_: None), None, None)
@@ -138,7 +136,6 @@ def test_a_run_in_real_time_that_fails_hears_nothing_any_more(inbox: None, monke
 
 
 def test_what_an_outsider_does_is_marked_when_its_first_action_begins(monkeypatch: pytest.MonkeyPatch) -> None:
-    from hil.inject import injection
     from hil.inject.scenario import load_scenario
 
     name = "flood_low_priority"
@@ -158,7 +155,7 @@ def test_what_an_outsider_does_is_marked_when_its_first_action_begins(monkeypatc
         if isinstance(text, dict):
             told.append((text["at"], seen[-1]))
 
-    monkeypatch.setattr(injection, "run", run)
+    monkeypatch.setattr(loop, "run", run)
     before = time.perf_counter()
     assert loop.outside(progress, name, "local:x")
     ((at, t),) = told

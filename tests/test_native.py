@@ -501,7 +501,7 @@ def test_a_defect_of_ours_beside_a_controller_names_its_place(
         raise KeyError("level.square_root")
 
     monkeypatch.setenv("VANELOOP_DEBUG", "1")
-    monkeypatch.setattr("hil.bus.lockstep_bus.run_lockstep", broken)
+    monkeypatch.setattr("vaneloop.cli.run.run_lockstep", broken)
     words = ["run", "--bus", "lockstep", "--duration", "0.1", "--controller", wrong(gcc, tmp_path)]
     assert main(words) == 70
     err = capfd.readouterr().err

@@ -13,7 +13,9 @@ from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 
+import numpy as np
 import pytest
+import scipy
 
 from tests.conftest import ROOT
 from tests.pythons import PYTHONS
@@ -65,6 +67,62 @@ CLOCKS_AND_BUSES = {
     "threading",
     "time",
 }
+
+# Imports inside functions: file -> module -> why it is not at the top: an extra of pyproject.toml that brings it, or
+# the processor time that whoever does not use it would spend.
+LATE: dict[str, dict[str, str]] = {
+    "hil/bus/frames.py": {"can": "start-up: 120 ms"},
+    "hil/inject/__main__.py": {"vaneloop.cli.inject": "start-up: 900 ms, in which Ctrl-C is heard"},
+    "hil/inject/fuzz.py": {"can": "start-up: 120 ms"},
+    "hil/inject/fuzz_tools.py": {"hil.uds.station": "extra diagnostics"},
+    "hil/inject/sil.py": {  # loaded by every pytest
+        "controller": "start-up: 600 ms",
+        "hil.inject.any_controller": "start-up: 700 ms",
+        "hil.native": "start-up: 700 ms",
+    },
+    "hil/logs/dbc.py": {"cantools": "start-up: 120 ms"},
+    "hil/logs/guess.py": {"controller": "start-up: 300 ms", "plant.geometry": "start-up: 300 ms"},
+    "hil/logs/units.py": {"pint": "start-up: 270 ms"},
+    "hil/replay/__main__.py": {"vaneloop.cli.replay": "start-up: 900 ms, in which Ctrl-C is heard"},
+    "vaneloop/base/terminal.py": {
+        "rich": "start-up: 60 ms",
+        "rich.console": "start-up: 60 ms",
+        "rich.progress": "start-up: 70 ms",
+        "rich.table": "start-up: 70 ms",
+    },
+    "vaneloop/cli/attended.py": {"hil.uds.station": "extra diagnostics"},
+    "vaneloop/cli/design.py": {
+        "vaneloop.design.servo_design": "start-up: 1900 ms",
+        "vaneloop.pages.design": "start-up: 1900 ms",
+    },
+    "vaneloop/__init__.py": {"vaneloop.base.version": "start-up: 30 ms"},
+    "vaneloop/cli/main.py": {"vaneloop.base.version": "start-up: 30 ms"},
+    "vaneloop/design/multibody.py": {
+        "exudyn": "extra multibody",
+        "exudyn.itemInterface": "extra multibody",
+        "exudyn.utilities": "extra multibody",
+    },
+    "vaneloop/fleet/leases.py": {"psutil": "extra fleet"},
+    "vaneloop/fleet/rent.py": {
+        "dask": "extra fleet",
+        "dask.distributed": "extra fleet",
+        "distributed.security": "extra fleet",
+    },
+    "vaneloop/fleet/tables.py": {"duckdb": "extra fleet"},
+    "vaneloop/pages/page.py": {"plotly.offline": "start-up: 50 ms"},
+    "vaneloop/verbs/answer.py": {"plotly.graph_objects": "start-up: 50 ms"},
+    "vaneloop/verbs/machine.py": {  # a loop that runs has the machine and searches nothing
+        "vaneloop.identification.vane_chain.chain": "start-up: 300 ms",
+        "vaneloop.identification.vane_chain.resample": "start-up: 300 ms",
+        "vaneloop.verbs.long": "start-up: 300 ms",
+    },
+    "vaneloop/web/command.py": {"vaneloop.web.server": "extra web"},
+}
+# Files of the product that import each other, also by imports in functions and for types: no others may, and these
+# should not.
+CIRCLES: list[set[str]] = [
+    {"vaneloop/identification/least_squares/levenberg_marquardt.py", "vaneloop/identification/least_squares/problem.py"}
+]
 
 # What each package exports. To change it on purpose, paste the line that the failing test prints.
 EXPORTS: dict[str, list[str]] = {
@@ -337,6 +395,108 @@ def test_no_code_of_the_product_names_what_is_not_installed(package: str) -> Non
 def test_a_name_of_what_is_not_installed_is_caught(source: str) -> None:
     assert names_of_the_checkout(source)
     assert not names_of_the_checkout("'see tests/rig'; row = {'tests': 4}  # tests.rig")
+
+
+def product_files() -> dict[str, str]:
+    """Sources of the product by their paths from the root; what users begin with is theirs."""
+    files = (f for top in PACKAGES for f in python_files(top) if "templates" not in f.parts)
+    return {f.relative_to(ROOT).as_posix(): f.read_text(encoding="utf-8") for f in files}
+
+
+def late_imports(source: str) -> dict[str, int]:
+    """Modules that functions import, also by import_module with a constant name, with the line of the last import."""
+    found: dict[str, int] = {}
+    for function in ast.walk(ast.parse(source)):
+        if not isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            continue
+        for node in ast.walk(function):
+            if isinstance(node, ast.Import):
+                found |= {alias.name: node.lineno for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                found["." * node.level + (node.module or "")] = node.lineno
+            elif (
+                isinstance(node, ast.Call)
+                and ast.unparse(node.func).rpartition(".")[2] in ("import_module", "__import__")
+                and isinstance(node.args[0], ast.Constant)
+            ):
+                found[str(node.args[0].value)] = node.lineno
+    return found
+
+
+def test_a_function_imports_only_extras_and_what_start_up_pays_for() -> None:
+    found = {file: late for file, source in product_files().items() if (late := late_imports(source))}
+    new = [
+        f"{file}:{line}: {module} is imported in a function. Import it at the top of the file; or, where an extra "
+        f"brings it or start-up pays for it, enter it in LATE of this file with its reason"
+        for file, late in found.items()
+        for module, line in late.items()
+        if module not in LATE.get(file, {})
+    ]
+    assert not new, "\n".join(new)
+    gone = [f"{file}: {module}" for file, late in LATE.items() for module in late if module not in found.get(file, {})]
+    assert not gone, f"LATE names what is not imported in a function any more: {gone}"
+
+
+def test_each_late_import_has_a_reason_that_holds() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    for file, late in LATE.items():
+        for module, reason in late.items():
+            kind, _, what = reason.partition(" ")
+            assert (kind == "extra" and what in extras) or re.match(r"start-up: \d+ ms", reason), (file, module, reason)
+
+
+@pytest.mark.parametrize(
+    ("source", "modules"),
+    [
+        ("import a\nfrom b import c", []),
+        ("def f():\n    import a.b\n    from c import d", ["a.b", "c"]),
+        ("class A:\n    async def f(self):\n        if True:\n            from . import d", ["."]),
+        ("f = lambda: importlib.import_module('a.b')\ng = lambda n: importlib.import_module(n)", ["a.b"]),
+    ],
+)
+def test_an_import_in_a_function_is_found(source: str, modules: list[str]) -> None:
+    assert list(late_imports(source)) == modules
+
+
+def circles(sources: dict[str, str]) -> list[set[str]]:
+    """Sets of files that import each other, directly or by way of others: at the top, in functions, for types.
+
+    ``from a import b`` is an import of the file a/b.py where there is one, and of a else.
+    """
+    names = {file.removesuffix(".py").removesuffix("/__init__").replace("/", "."): file for file in sources}
+    number = {file: i for i, file in enumerate(sources)}
+    graph = np.zeros((len(sources), len(sources)), dtype=bool)
+    for file, source in sources.items():
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                wanted = [f"{node.module}.{a.name}" if f"{node.module}.{a.name}" in names else node.module
+                          for a in node.names]  # fmt: skip
+            else:
+                wanted = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            for name in wanted:
+                if name in names and names[name] != file:
+                    graph[number[file], number[names[name]]] = True
+    many, of = scipy.sparse.csgraph.connected_components(graph, connection="strong")
+    sets = [{file for file in sources if of[number[file]] == k} for k in range(many)]
+    return [s for s in sets if len(s) > 1]
+
+
+def test_files_import_each_other_in_no_new_circle() -> None:
+    found = circles(product_files())
+    new = [f"import each other: {', '.join(sorted(c))}" for c in found if c not in CIRCLES]
+    assert not new, "\n".join(new)
+    assert not (gone := [c for c in CIRCLES if c not in found]), f"no circle any more, take it out of CIRCLES: {gone}"
+
+
+def test_a_circle_of_files_is_found() -> None:
+    sources = {
+        "a/__init__.py": "from a.b import x",
+        "a/b.py": "def f():\n    from a import c",
+        "a/c.py": "if TYPE_CHECKING:\n    import a.d",
+        "a/d.py": "from a.b import f",
+        "a/e.py": "import a.d",
+    }
+    assert circles(sources) == [{"a/b.py", "a/c.py", "a/d.py"}]
 
 
 def packages_with_init() -> list[str]:

@@ -24,7 +24,7 @@ from vaneloop.identification.unmodelled.fitted_candidate import Outcome
 from vaneloop.verbs import learn, long, parts, search
 from vaneloop.verbs import replay as replay_verb
 from vaneloop.verbs.long import Held, Whole
-from vaneloop.verbs.machine import TABLES, Machine, files_of
+from vaneloop.verbs.machine import TABLES, Machine, files_of, with_law_files
 
 # ---- parts of logs ---------------------------------------------------------------------------------------------------
 
@@ -125,9 +125,9 @@ def test_fits_are_held_against_the_part_that_they_have_not_seen() -> None:
 
 def test_parameters_are_carried_by_their_names() -> None:
     here, there = stage("a"), stage("b")
-    assert parts.carried(here, np.array([7.0, 5.0, 2.0]), there).tolist() == [7.0, 0.0, 2.0]
+    assert long.carried(here, np.array([7.0, 5.0, 2.0]), there).tolist() == [7.0, 0.0, 2.0]
     other = replace(there, effects=(replace(there.effects[0], name="other"),))
-    assert parts.carried(here, np.array([7.0, 5.0, 2.0]), other).tolist() == [7.0, 0.0, 0.0]
+    assert long.carried(here, np.array([7.0, 5.0, 2.0]), other).tolist() == [7.0, 0.0, 0.0]
 
 
 # ---- records of systems ----------------------------------------------------------------------------------------------
@@ -148,7 +148,7 @@ def test_a_log_of_a_system_is_on_the_raster_of_its_output_with_most_samples(monk
         "one": Channel(np.array([0.5]), np.array([3.0])),
     })  # fmt: skip
     asked: list[Any] = []
-    monkeypatch.setattr("hil.logs.read_log", lambda path, **how: asked.append((path, how)) or log)
+    monkeypatch.setattr(parts, "read_log", lambda path, **how: asked.append((path, how)) or log)
     found, notes = parts.read_record("logs/r.csv", system(), design_rpm=5000.0)
     signals = {"u": "V", "y": "mm", "z": "mm"}
     assert asked == [("logs/r.csv", {"design_rpm": 5000.0, "require": list(signals), "signals": signals})]
@@ -284,12 +284,12 @@ def test_pieces_are_added_until_every_visited_bin_is_in() -> None:
 def test_an_excerpt_has_half_its_pieces_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
     monkeypatch.setattr(long, "spread", lambda pieces, many, _: asked.append((pieces, many)) or [0])
-    machine: Any = SimpleNamespace(stages_of=lambda log, grid, rows: Stages(rows))
+    stages_of: Any = lambda log, grid, rows: Stages(rows)  # noqa: E731
     whole = whole_of(9, at_levels([0.0] * 9))
     for fitted, many in ((3000, 5), (600, 2), (0, 2), (3599, 5)):
-        chain: Any = long.excerpted(whole.log, whole.grid, machine, fitted)
+        chain: Any = long.excerpted(whole.log, whole.grid, stages_of, fitted)
         assert asked.pop() == (9, many) and chain.rows == [(0, 600)] and chain.whole.chosen == (0,)
-    long.excerpted(whole.log, whole.grid, machine)
+    long.excerpted(whole.log, whole.grid, stages_of)
     assert asked == [(9, 200)]  # of 120,000 rows
 
 
@@ -449,7 +449,7 @@ def test_a_log_of_more_than_an_hour_is_fitted_on_an_excerpt(
     rows: int, excerpt: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("vaneloop.identification.vane_chain.resample.grid_of", lambda log: Grid(rows=rows))
-    monkeypatch.setattr(long, "excerpted", lambda log, grid, machine: "excerpt")
+    monkeypatch.setattr(long, "excerpted", lambda log, grid, stages_of: "excerpt")
     monkeypatch.setattr(Machine, "stages_of", lambda self, log, grid: "all")
     log: Any = None
     assert Machine().bind(log) == ("excerpt" if excerpt else "all")
@@ -534,12 +534,12 @@ def test_law_files_are_added_by_their_names(tmp_path: Path) -> None:
     write_model(tmp_path / "law.toml", Model(curves={"bend": CURVE}, effects={"bend": {"c1": 0.5}}))
     write_model(tmp_path / "other.toml", Model())
     machine = Machine(model=Model(effects={"lvdt_bias": {"bias": 0.1}}))
-    wanted, model = learn.with_law_files(["valve_lag", str(tmp_path / "law.toml")], machine)
+    wanted, model = with_law_files(["valve_lag", str(tmp_path / "law.toml")], machine)
     assert wanted == ["valve_lag", "bend"] and model.curves == {"bend": CURVE}
     assert model.effects == {"lvdt_bias": {"bias": 0.1}, "bend": {"c1": 0.5}}
-    assert learn.with_law_files(["valve_lag"], machine) == (["valve_lag"], machine.added)
+    assert with_law_files(["valve_lag"], machine) == (["valve_lag"], machine.added)
     with pytest.raises(InputError, match="has no table curves; allowed: a law file of vaneloop learn"):
-        learn.with_law_files([str(tmp_path / "other.toml")], machine)
+        with_law_files([str(tmp_path / "other.toml")], machine)
 
 
 def tried(size: float = 2.0, jump: bool = False) -> Any:
@@ -580,10 +580,8 @@ def test_without_a_curve_the_others_are_fitted_from_where_they_are() -> None:
 
 def test_which_stages_are_asked_for_laws(monkeypatch: pytest.MonkeyPatch) -> None:
     noisy: list[bool] = []
-    monkeypatch.setattr(
-        "vaneloop.identification.unmodelled.likelihood_acceptance.above_the_noise", lambda judge, base: noisy[-1]
-    )
-    monkeypatch.setattr("vaneloop.identification.least_squares.problem.LeastSquaresProblem", lambda stage, floor: None)
+    monkeypatch.setattr(learn, "above_the_noise", lambda judge, base: noisy[-1])
+    monkeypatch.setattr(learn, "LeastSquaresProblem", lambda stage, floor: None)
     for made, verdict, above, asked in (
         ("x", "missing", True, False), ("x", "unknown", False, True), ("x", "none", True, True),
         ("x", "none", False, False), (None, "unknown", True, False),
@@ -611,7 +609,6 @@ class Learning:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **stages: tuple[str, Says | None]):
         self.told: list[float] = []
         self.asked: list[Any] = []
-        unmodelled = "vaneloop.identification.unmodelled"
         says = {name: said for name, (_, said) in stages.items()}
 
         def learner(ground: Any, d: Any, tell: Any, shape: Any, formulas: bool) -> Any:
@@ -620,17 +617,10 @@ class Learning:
             return SimpleNamespace(learned=lambda: says[d.stage], judge="judge", base="base")
 
         monkeypatch.setattr(learn, "_open", lambda chain, d: d.verdict != "missing")
-        monkeypatch.setattr(f"{unmodelled}.learning.CurveSearch", learner)
-        monkeypatch.setattr(
-            "vaneloop.identification.vane_chain.candidates.VaneChainCandidates",
-            lambda stage, floor, test: (stage.name, test),
-        )
-        monkeypatch.setattr(
-            f"{unmodelled}.learned_law.law_of", lambda ground, before, tried: law(tried.name, before=before)
-        )
-        monkeypatch.setattr(
-            f"{unmodelled}.parametric_substitution.spoken", lambda learner, tried, own: (tried[-1], own)
-        )
+        monkeypatch.setattr(learn, "CurveSearch", learner)
+        monkeypatch.setattr(learn, "VaneChainCandidates", lambda stage, floor, test: (stage.name, test))
+        monkeypatch.setattr(learn, "law_of", lambda ground, before, tried: law(tried.name, before=before))
+        monkeypatch.setattr(learn, "spoken", lambda learner, tried, own: (tried[-1], own))
         monkeypatch.setattr(learn, "_as_model", lambda model, kept, laws, last: model.noted(f"{len(kept.tried)} laws"))
         monkeypatch.setattr(learn, "_with_stage", lambda model, judge, fit: model.noted(f"stage of {judge}"))
         monkeypatch.setattr(learn, "with_fits", lambda model, stages: model.noted(f"fits of {len(stages)}"))
@@ -783,7 +773,7 @@ def test_a_model_fails_where_a_stage_or_a_time_of_a_long_log_does(stages: Any, h
 
 
 def test_a_page_is_headed_by_what_was_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vaneloop.pages.diagnosis.compare_page", lambda *a: a)
+    monkeypatch.setattr(search, "compare_page", lambda *a: a)
     bound: Any = SimpleNamespace(test=None)
     compared = search.Stages(bound, [], "a.csv")
     one, two = (replace(compared, verb=verb).page("words") for verb in ("compare", "locate"))
@@ -808,7 +798,7 @@ def test_an_extended_model_is_written(tmp_path: Path) -> None:
 def test_a_controller_of_the_user_s_own_has_the_scalars_beside_the_tables(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hil.native.Program", lambda path, own: (path, own))
+    monkeypatch.setattr("vaneloop.verbs.machine.Program", lambda path, own: (path, own))
     assert Machine().calibration.program is None
     assert Machine(controller="c.so").calibration.program == ("c.so", None)
     (tmp_path / "calibration.toml").write_text(Path("tables/calibration.toml").read_text())
@@ -892,9 +882,7 @@ def test_verbs_tell_a_system_from_a_machine(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(search, "not_given", lambda chain, without: (chain, *without))
     monkeypatch.setattr(search, "diagnosed", lambda *a: ("diagnosed", *a))
     monkeypatch.setattr(search, "compared", lambda *a, progress: ("compared", *a, progress))
-    monkeypatch.setattr(
-        "vaneloop.identification.vane_chain.experiment.recommend", lambda d, progress, bound: {"text": "go"}
-    )
+    monkeypatch.setattr(search, "recommend", lambda d, progress, bound: {"text": "go"})
     machine, tell = Machine(), object()
     said: Any = search.diagnose("a.csv", machine, fit="0:1", without=["x"], progress=tell)  # type: ignore[arg-type]
     assert said == ("diagnosed", ("chain", "x"), "a.csv", 2, tell) and asked == [("chain", "a.csv", machine, "0:1", ())]
@@ -927,7 +915,6 @@ class Own:
     """Stands for what `learn` calls on a system's logs: what each part was asked, and what it says."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, verdict: str = "learned", errors: Sequence[float] = (2.0, 1.5)):
-        unmodelled, answers = "vaneloop.identification.unmodelled", "vaneloop.identification.results"
         self.asked: dict[str, list[Any]] = {}
         self.told: list[float] = []
         self.judge = SimpleNamespace(
@@ -945,18 +932,14 @@ class Own:
         )
         self.by_log = SimpleNamespace(model=Model(meta={"x": 1}), json=dict)
         self.errors = errors
-        for at, said in (
-            (f"{unmodelled}.learning.CurveSearch", self.learner),
-            (f"{unmodelled}.curve_candidates.UserModelCandidates", "ground"),
-            (f"{unmodelled}.curve_candidates.on_logs", "logs on"), (f"{answers}.rms_of", 4.0),
-            (f"{answers}.found_of", "found"), (f"{answers}.answer_of", self.answer()),
-            ("vaneloop.identification.user_models.by_log.ByLog.of", self.by_log),
+        for name, said in (
+            ("CurveSearch", self.learner), ("UserModelCandidates", "ground"), ("on_logs", "logs on"), ("rms_of", 4.0),
+            ("found_of", "found"), ("answer_of", self.answer()),
         ):  # fmt: skip
-            monkeypatch.setattr(at, self.note(at.rpartition(".")[2], said))
-        monkeypatch.setattr(f"{unmodelled}.learned_law.law_of", self.law_of)
-        monkeypatch.setattr(
-            f"{unmodelled}.parametric_substitution.spoken", lambda learner, tried, laws: (tried[0], laws[:1])
-        )
+            monkeypatch.setattr(learn, name, self.note(name, said))
+        monkeypatch.setattr("vaneloop.identification.user_models.by_log.ByLog.of", self.note("of", self.by_log))
+        monkeypatch.setattr(learn, "law_of", self.law_of)
+        monkeypatch.setattr(learn, "spoken", lambda learner, tried, laws: (tried[0], laws[:1]))
         monkeypatch.setattr(learn, "_without", lambda judge, fit, names, n: f"without {n}" if len(names) > 1 else None)
         monkeypatch.setattr(learn, "_as_model", self.note("as_model", "the model"))
         logs = SimpleNamespace(fitted=None, test=None)
@@ -1048,8 +1031,8 @@ def test_learning_on_a_system_diagnoses_first(beside: Any, monkeypatch: pytest.M
 
 
 def test_learning_on_a_machine_takes_its_chain(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(search, "chain_for", lambda log, machine, fit, test: ((log, machine, fit, test), "a.csv"))
-    monkeypatch.setattr(search, "not_given", lambda chain, without: (*chain, *without))
+    monkeypatch.setattr(learn, "chain_for", lambda log, machine, fit, test: ((log, machine, fit, test), "a.csv"))
+    monkeypatch.setattr(learn, "not_given", lambda chain, without: (*chain, *without))
     monkeypatch.setattr(learn, "learned", lambda *a: a)
     machine = Machine(model=Model(meta={"x": 1}))
     said: Any = learn.learn("a.csv", machine, fit="0:1", test="1:2", without=["x"], shape=["odd"], workers=3)
@@ -1063,13 +1046,9 @@ def test_the_first_law_is_written_as_python(tmp_path: Path, monkeypatch: pytest.
     class Surface(SimpleNamespace):
         pass
 
-    monkeypatch.setattr("vaneloop.identification.unmodelled.learned_surface.LearnedSurface", Surface)
-    monkeypatch.setattr(
-        "vaneloop.identification.unmodelled.python_law.python_law", lambda law, system: f"{law.name} {system}"
-    )
-    monkeypatch.setattr(
-        "vaneloop.identification.unmodelled.python_surface.python_surface", lambda law: f"surface {law.name}"
-    )
+    monkeypatch.setattr(learn, "LearnedSurface", Surface)
+    monkeypatch.setattr(learn, "python_law", lambda law, system: f"{law.name} {system}")
+    monkeypatch.setattr(learn, "python_surface", lambda law: f"surface {law.name}")
     own: Any = "pump"
     laws = [law("one"), law("two")]
     assert answer("learned", laws).write_python(tmp_path / "l.py", own) == tmp_path / "l.py"
@@ -1100,12 +1079,9 @@ class Beside(Own):
         )
         laws = [law("first", error_after=9.0), law("last", error_after=after)] if more.get("found", True) else []
         self.said = learn.Learned(self.of, Outcome("learned", notes=[]), laws, self.with_them, log="x")  # type: ignore[arg-type]
-        models = "vaneloop.identification.user_models.by_log"
-        monkeypatch.setattr(f"{models}.bind", lambda *a: self.bound.append(a) or self.again)
-        monkeypatch.setattr(f"{models}.as_given", lambda logs, fit: self.given)
-        monkeypatch.setattr(
-            "vaneloop.identification.least_squares.problem.LeastSquaresProblem", lambda stage, floor: self.judge
-        )
+        monkeypatch.setattr(learn, "bind", lambda *a: self.bound.append(a) or self.again)
+        monkeypatch.setattr(learn, "as_given", lambda logs, fit: self.given)
+        monkeypatch.setattr(learn, "LeastSquaresProblem", lambda stage, floor: self.judge)
         monkeypatch.setattr(learn, "_learned", lambda again, *a: self.bound.append((again, *a)) or self.said)
 
     def beside(self, alone: Any = None) -> Any:
@@ -1163,9 +1139,9 @@ def test_what_was_learned_alone_stands_where_it_does_as_well(monkeypatch: pytest
     def fails(*_: Any) -> Any:
         raise StageError("does not run")
 
-    monkeypatch.setattr("vaneloop.identification.user_models.by_log.bind", fails)
+    monkeypatch.setattr(learn, "bind", fails)
     assert Beside(monkeypatch).beside() is not None
-    monkeypatch.setattr("vaneloop.identification.user_models.by_log.bind", fails)
+    monkeypatch.setattr(learn, "bind", fails)
     assert at.beside() is None
 
 
@@ -1180,10 +1156,9 @@ def extending(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(search, "as_compared", lambda stage, answer: answer)
     monkeypatch.setattr(search, "no_better", lambda answer: "no better" if answer.stage == "linkage" else None)
     monkeypatch.setattr(search, "changed", lambda chain, change: change(chain))
-    ground = "vaneloop.identification.vane_chain.candidates"
-    monkeypatch.setattr(f"{ground}.with_laws", lambda stage, names, curves, log: SimpleNamespace(
+    monkeypatch.setattr(search, "with_laws", lambda stage, names, curves, log: SimpleNamespace(
         name=stage.name, given=(tuple(names), tuple(curves), log)))  # fmt: skip
-    monkeypatch.setattr(f"{ground}.curve_effect", lambda name, law: (name, law.values))
+    monkeypatch.setattr(search, "curve_effect", lambda name, law: (name, law.values))
 
     @dataclass
     class Shown:
@@ -1262,7 +1237,7 @@ def test_of_a_surface_what_goes_on_is_its_range(monkeypatch: pytest.MonkeyPatch)
     class Surface(SimpleNamespace):
         pass
 
-    monkeypatch.setattr("vaneloop.identification.unmodelled.learned_surface.LearnedSurface", Surface)
+    monkeypatch.setattr(learn, "LearnedSurface", Surface)
     second = {"of": "t_oil", "low": 10.0, "high": 20.0, "form": "line"}
     formula = SimpleNamespace(form="line", numbers={"a": 3.0})
     made = Surface(**vars(law("s", spoken=formula, axis=lambda: second)))
@@ -1274,7 +1249,7 @@ def test_of_a_surface_what_goes_on_is_its_range(monkeypatch: pytest.MonkeyPatch)
 
 def test_a_log_is_read_where_it_is_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
-    monkeypatch.setattr("hil.logs.read_log", lambda path, **how: asked.append((path, how)) or "the log")
+    monkeypatch.setattr(replay_verb, "read_log", lambda path, **how: asked.append((path, how)) or "the log")
     log = Log("a.csv", {"n_dem": Channel(T, 60.0 + T)})
     assert replay_verb.log_of(log, Machine()) is log and asked == []
     for name in ("a.csv", Path("a.csv")):
@@ -1295,7 +1270,7 @@ def test_a_log_is_read_where_it_is_a_name(monkeypatch: pytest.MonkeyPatch) -> No
 def test_stages_are_compared_and_told_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[float] = []
     bound: Any = SimpleNamespace(not_observed={"b": "x"}, test=None)
-    monkeypatch.setattr("vaneloop.pages.diagnosis.located_sentence", lambda *a: a)
+    monkeypatch.setattr(search, "located_sentence", lambda *a: a)
     assert search.Stages(bound, ["x"]).sentence() == (["x"], {"b": "x"}, ())  # type: ignore[comparison-overlap, list-item]
     said: Any = search.Stages(bound, [], held=HELD).sentence()
     assert said == ([], {"b": "x"}, HELD.failing)
@@ -1306,9 +1281,7 @@ def test_stages_are_compared_and_told_in_a_sentence(monkeypatch: pytest.MonkeyPa
 
 
 def test_effects_are_left_out_of_every_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "vaneloop.identification.vane_chain.candidates.without_laws", lambda stages, effects: (stages, effects)
-    )
+    monkeypatch.setattr(search, "without_laws", lambda stages, effects: (stages, effects))
     monkeypatch.setattr(search, "changed", lambda chain, change: change(chain))
     chain: Any = Stages([], stages="stages")
     assert search.not_given(chain, []) is chain

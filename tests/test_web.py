@@ -1627,7 +1627,7 @@ def test_the_workbench_of_another_machine_says_so_in_its_commands(tmp_path: Path
 def test_the_live_loop_runs_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from vaneloop.base.vanes import VANES
     from vaneloop.web import loop
-    from vaneloop.web.worker import Inbox
+    from vaneloop.web.process import Inbox
 
     monkeypatch.setattr(loop, "INBOX", Inbox())  # what the loop ends before it hears reaches no other test
     told: list[dict[str, Any]] = []

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import argparse
 
+from hil.calibrate import Memory
+from hil.calibrate.a2l import a2l_of
+from hil.calibrate.station import MASTER, SLAVE
+from hil.loop.node import Node
 from vaneloop.base import terminal
 from vaneloop.base.files import write
 from vaneloop.cli import options
@@ -31,11 +35,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 @options.guarded
 def command(args: argparse.Namespace) -> int:
     """Write the file; return the exit code."""
-    from hil.calibrate import Memory
-    from hil.calibrate.a2l import a2l_of
-    from hil.calibrate.station import MASTER, SLAVE
-    from hil.loop.node import Node
-
     machine = options.machine_of(args)
     memory = Memory(Node(machine.plant, machine.calibration))
     text = a2l_of(memory, master=MASTER, slave=SLAVE)

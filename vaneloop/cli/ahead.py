@@ -17,10 +17,18 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numba
+import numpy as np
+from numba.core.registry import cpu_target
+
+from hil.logs import Channel, write_log
+from hil.loop.lockstep import Stimulus, lockstep
+from hil.loop.node import Ecu, Node
 from vaneloop.base import terminal
 from vaneloop.base.child import python_module
 from vaneloop.base.files import write
 from vaneloop.base.kept import AHEAD, sources_digest
+from vaneloop.cli.main import main as vaneloop
 
 __all__ = ["JOBS", "main"]
 
@@ -29,11 +37,6 @@ SECONDS = 40  # of the run that is searched
 
 def _simulated(folder: Path) -> None:
     """The loop in simulated time, on a run that the other jobs read."""
-    import numpy as np
-
-    from hil.logs import Channel, write_log
-    from hil.loop.lockstep import Stimulus, lockstep
-
     n_dem = np.repeat([60.0, 90.0, 70.0, 95.0], SECONDS * 25)
     run = lockstep(Stimulus.of(n_dem), seed=1)
     columns = {k: Channel(run.t, v) for k, v in run.columns.items() if k not in ("t", "n_engine")}
@@ -43,18 +46,11 @@ def _simulated(folder: Path) -> None:
 
 def _searched(folder: Path) -> None:
     """The search for what a model lacks."""
-    from vaneloop.cli.main import main as vaneloop
-
     assert vaneloop(["diagnose", str(folder / "run.parquet"), "--quiet", "--workers", "1"]) in (0, 1)
 
 
 def _on_the_bus(folder: Path) -> None:
     """The reader of CAN logs, the nodes, and frames in simulated time."""
-    import numpy as np
-
-    from hil.loop.node import Ecu, Node
-    from vaneloop.cli.main import main as vaneloop
-
     assert vaneloop(["replay", str(folder / "run.blf"), "--quiet"]) in (0, 1)
     nothing = np.zeros((1, 2), np.int64)
     Node().tick(nothing, 0)
@@ -69,9 +65,6 @@ JOBS: tuple[dict[str, Callable[[Path], None]], ...] = (
 
 
 def _what() -> str:
-    import numba
-    from numba.core.registry import cpu_target
-
     processor = cpu_target.target_context.codegen().magic_tuple()
     return f"{sys.version} numba {numba.__version__} {processor} {sources_digest()}"
 

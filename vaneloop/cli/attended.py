@@ -10,6 +10,15 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from hil.calibrate import Attended, Memory, Slave
+from hil.calibrate.a2l import a2l_of
+from hil.calibrate.daq import gather
+from hil.calibrate.prepare import Desk, Outside
+from hil.calibrate.station import MASTER, SLAVE, XcpService
+from hil.uds import Server, TroubleMemory
+from hil.uds.server import FUNCTIONAL, REQUEST
 from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
 from vaneloop.base.files import cannot_write, check, write
@@ -43,8 +52,6 @@ def wanted(args: argparse.Namespace) -> bool:
 
 def check_service_options(args: argparse.Namespace, lockstep: bool) -> None:
     """Refuse options that do not go together. Raises InputError."""
-    from vaneloop.base.errors import InputError
-
     for option in ("xcp_save", "xcp_lock", "xcp_open"):
         if getattr(args, option) and not args.xcp:
             raise InputError(f"--{option.replace('_', '-')} belongs to --xcp")
@@ -72,12 +79,8 @@ def accepted(args: argparse.Namespace) -> list[dict[str, int]]:
     """The acceptance filters: the node's, and those of its tools."""
     idents: list[int] = []
     if args.xcp:
-        from hil.calibrate.station import MASTER
-
         idents.append(MASTER)
     if args.uds:
-        from hil.uds.station import FUNCTIONAL, REQUEST
-
         idents += [REQUEST, FUNCTIONAL]
     return [*station.ACCEPTED, *({"can_id": ident, "can_mask": 0x7FF} for ident in idents)]
 
@@ -89,14 +92,6 @@ def attend(args: argparse.Namespace, node: Any, *, recorded: bool = False) -> An
     """
     if not wanted(args):
         return node
-    import numpy as np
-
-    from hil.calibrate import Attended, Memory, Slave
-    from hil.calibrate.a2l import a2l_of
-    from hil.calibrate.daq import gather
-    from hil.calibrate.prepare import Desk, Outside
-    from hil.calibrate.station import MASTER, SLAVE, XcpService
-
     memory = Memory(node)
     if not recorded:
         memory.desk = Desk(Outside(memory.elements))
@@ -120,7 +115,6 @@ def attend(args: argparse.Namespace, node: Any, *, recorded: bool = False) -> An
 
 def _uds(args: argparse.Namespace, memory: Any) -> Any:
     """The UDS server, with the trouble codes of ``--uds-memory``."""
-    from hil.uds import Server, TroubleMemory
     from hil.uds.station import UdsService
 
     if not args.uds_memory:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from typing import TYPE_CHECKING
+from xml.etree import ElementTree as Xml
 
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
@@ -12,6 +13,12 @@ from vaneloop.base.extras import needs
 from vaneloop.base.files import write
 from vaneloop.cli import options
 from vaneloop.cli.fleet import tell_damaged, unusable
+from vaneloop.fleet import campaign, state
+from vaneloop.fleet.folder import Folder
+from vaneloop.fleet.leases import BEATS
+from vaneloop.fleet.plan import load_plan
+from vaneloop.fleet.rent import known, rent
+from vaneloop.pages.campaign import campaign_page
 
 if TYPE_CHECKING:
     from vaneloop.pages.campaign import CampaignView
@@ -60,11 +67,6 @@ def command(args: argparse.Namespace) -> int:
 
 
 def _command(args: argparse.Namespace) -> int:
-    from vaneloop.fleet import campaign
-    from vaneloop.fleet.plan import load_plan
-    from vaneloop.fleet.rent import known
-    from vaneloop.pages.campaign import campaign_page
-
     if not 1 <= args.workers <= 10_000:
         raise InputError(f"--workers (={args.workers}) must be in [1, 10000]")
     for option, low, high in (("limit", 1e-3, 1e6), ("patience", 0.5, 1e5)):
@@ -97,11 +99,6 @@ def _command(args: argparse.Namespace) -> int:
 
 def _work(args: argparse.Namespace, folder: object, what: str) -> None:
     """Have the workers do what is left."""
-    from vaneloop.fleet import state
-    from vaneloop.fleet.folder import Folder
-    from vaneloop.fleet.leases import BEATS
-    from vaneloop.fleet.rent import rent
-
     assert isinstance(folder, Folder)
     state.tidy(folder)
     if not set(folder.chunks()) - folder.finished():
@@ -134,8 +131,6 @@ def _show(args: argparse.Namespace, view: CampaignView, search: int) -> None:
 
 def _write_junit(file: str, view: CampaignView) -> None:
     """Write JUnit's XML: a suite a combination, a case a requirement, and one for the verdict of the combination."""
-    from xml.etree import ElementTree as Xml
-
     root = Xml.Element("testsuites", name=view.title)
     for g in view.groups:
         cases: list[tuple[str, str]] = []

@@ -6,7 +6,10 @@ import argparse
 import sys
 from dataclasses import asdict, replace
 
+from plant import load_geometry
+from plant.spatial import Clearances
 from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
 from vaneloop.design.clearance import FITS, WORDS, clearance_study, study_rows
 from vaneloop.pages.mechanism import clearance_page
 
@@ -63,10 +66,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from plant import load_geometry
-    from plant.spatial import Clearances
-    from vaneloop.base.errors import InputError
-
     fits = Clearances(**{joint: getattr(args, joint) for joint in FITS})
     fits.check()
     if args.ring is not None:

@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 
+from hil.logs import LogError
 from vaneloop.base import terminal
 from vaneloop.cli import options, own_model, replay
-from vaneloop.cli.options import chain_of, guarded
+from vaneloop.cli.chains import chain_of
+from vaneloop.cli.options import guarded
+from vaneloop.pages import story
+from vaneloop.verbs.search import compared
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -35,10 +39,6 @@ def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     if own_model.asked(args):
         return _own(args)
-    from hil.logs import LogError
-    from vaneloop.pages import story
-    from vaneloop.verbs.search import compared
-
     extra: dict[str, object] = {}
     report, args.report = args.report, None
     stages: list[dict[str, object]] = []

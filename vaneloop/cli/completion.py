@@ -10,9 +10,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import hil.inject
+from controller import STRATEGIES
 from hil.logs.formats import suffixes
+from hil.loop.ecu import BUILTIN
+from plant.effects import EFFECTS
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError, meant
+from vaneloop.cli.main import COMMANDS
+from vaneloop.design.links import CRITERIA
 
 __all__ = ["DESCRIPTION", "SHELLS", "add_options", "command"]
 
@@ -67,12 +73,6 @@ class _Taken:
 
 def _known() -> dict[str, tuple[str, ...]]:
     """Words that options and places take beside files, where the parser does not list them."""
-    import hil.inject
-    from controller import STRATEGIES
-    from hil.loop.ecu import BUILTIN
-    from plant.effects import EFFECTS
-    from vaneloop.design.links import CRITERIA
-
     profiles = (*BUILTIN, "engine-test")
     scenarios = (Path(hil.inject.__file__).parent / "scenarios").glob("*.toml")
     return {
@@ -89,8 +89,6 @@ _ALONE = ("--strategy", "--criterion", "--on", "--without", "shell")  # no file 
 
 def _commands() -> dict[str, list[_Taken]]:
     """What every command takes, and every part of a command (fleet run)."""
-    from vaneloop.cli.main import COMMANDS
-
     known = _known()
 
     def taken(name: str, parser: argparse.ArgumentParser) -> Iterator[tuple[str, list[_Taken]]]:
@@ -119,8 +117,6 @@ def _commands() -> dict[str, list[_Taken]]:
 
 
 def _about() -> dict[str, str]:
-    from vaneloop.cli.main import COMMANDS
-
     return {name: text for name, (_, text) in COMMANDS.items()}
 
 

@@ -7,8 +7,12 @@ import sys
 from typing import Any
 
 from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
 from vaneloop.cli import options, own_model
-from vaneloop.cli.options import add_machine_options, chain_of
+from vaneloop.cli.chains import chain_of
+from vaneloop.cli.options import add_machine_options
+from vaneloop.pages.story import CANNOT, doubt, word
+from vaneloop.verbs.search import diagnosed, not_given
 
 __all__ = ["DESCRIPTION", "add_options", "command", "show"]
 
@@ -40,9 +44,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 @options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from vaneloop.base.errors import InputError
-    from vaneloop.verbs.search import diagnosed, not_given
-
     if not 1 <= args.workers <= 64:
         raise InputError(f"--workers (={args.workers}) must be in [1, 64]")
     if own_model.asked(args):
@@ -62,8 +63,6 @@ def command(args: argparse.Namespace) -> int:
 
 def show(args: argparse.Namespace, answer: Any) -> None:
     """Print the verdict, the stages and the effects."""
-    from vaneloop.pages.story import CANNOT, doubt, word
-
     d = answer.diagnosis
     rows = []
     for s in d.stages:

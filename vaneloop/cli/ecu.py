@@ -12,7 +12,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from controller import FAULTS, MODES
+from hil.bus.frames import R_GOOD, R_LOST, R_UNAUTHENTIC
+from hil.bus.port import Port
+from hil.engine_test import load_profile
+from hil.loop import ecu
+from hil.loop.ecu import EcuStation, Typed
+from hil.loop.node import Ecu
+from hil.loop.realtime import Ticker, run_realtime, stop_on_signals, wall_clock
 from vaneloop.base import terminal
+from vaneloop.base.errors import InputError, meant
+from vaneloop.base.tables import load_toml
 from vaneloop.base.vanes import VANES
 from vaneloop.cli import options, station
 
@@ -80,10 +92,6 @@ def demand_of(args: argparse.Namespace, notes: list[str], default: str | None = 
     """Return the demand that ``--profile`` or ``--log`` names, else the builtin profile ``default``; None for a typed
     one. What there is to note on reading it is said, and goes into ``notes``.
     """
-    from hil.loop import ecu
-    from vaneloop.base.errors import InputError, meant
-    from vaneloop.base.tables import load_toml
-
     if args.profile and args.log:
         raise InputError("--profile and --log exclude each other")
     table = args.profile if args.profile and Path(args.profile).suffix.lower() not in ("", ".toml") else None
@@ -105,10 +113,6 @@ def demand_of(args: argparse.Namespace, notes: list[str], default: str | None = 
         return ecu.builtin(name)
     path = Path(name)
     if name == "engine-test" or (path.suffix.lower() == ".toml" and path.is_file() and "speed" in load_toml(path)):
-        import numpy as np
-
-        from hil.engine_test import load_profile
-
         n_dem = load_profile("engine_test.toml" if name == "engine-test" else path)
         return ecu.Demand(np.arange(len(n_dem)) * 0.01, n_dem)
     if not path.suffix:
@@ -122,14 +126,6 @@ def demand_of(args: argparse.Namespace, notes: list[str], default: str | None = 
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from controller import FAULTS, MODES
-    from hil.bus.frames import R_GOOD, R_LOST, R_UNAUTHENTIC
-    from hil.bus.port import Port
-    from hil.loop.ecu import EcuStation, Typed
-    from hil.loop.node import Ecu
-    from hil.loop.realtime import Ticker, run_realtime, stop_on_signals, wall_clock
-    from vaneloop.base.errors import InputError
-
     station.check_realtime_options(args)
     station.check_seconds(args, "timeout", "wait")
     if args.seed is not None and args.seed < 0:

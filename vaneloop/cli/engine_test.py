@@ -9,11 +9,13 @@ import sys
 from typing import Any
 
 from hil.engine_test import engine_test, load_profile
+from hil.loop.lockstep import warm_up
 from hil.replay import STATISTICS, ReplayResult, replay_json
 from plant import build_plant
 from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
 from vaneloop.cli import options
-from vaneloop.pages.engine_test import PAPER_TABLE_5
+from vaneloop.pages.engine_test import PAPER_TABLE_5, engine_test_report
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -65,10 +67,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 @options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from hil.loop.lockstep import warm_up
-    from vaneloop.base.errors import InputError
-    from vaneloop.pages.engine_test import engine_test_report
-
     if args.hysteresis is not None and not 0.0 <= args.hysteresis <= 10.0:
         raise InputError(f"--hysteresis (={args.hysteresis:g} deg) must be in [0, 10]")
     if args.seed < 0:

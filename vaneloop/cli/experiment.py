@@ -6,9 +6,13 @@ import argparse
 import sys
 from pathlib import Path
 
+from hil.logs import Channel, write_log
 from vaneloop.base import terminal
 from vaneloop.cli import options
-from vaneloop.cli.options import add_machine_options, chain_of
+from vaneloop.cli.chains import chain_of
+from vaneloop.cli.options import add_machine_options
+from vaneloop.verbs.search import diagnosed
+from vaneloop.verbs.search import experiment as recommend
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -32,10 +36,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from hil.logs import Channel, write_log
-    from vaneloop.verbs.search import diagnosed
-    from vaneloop.verbs.search import experiment as recommend
-
     chain = chain_of(args, loop=True)
     with options.search_bar(args) as news:
         found = diagnosed(chain, args.log, news=news)

@@ -5,7 +5,11 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 
+from controller.calibration import CalibrationTable
+from hil.fmu import is_made, write_fmu
+from hil.fmu.variables import FIXED, INPUT, OUTPUT, TUNABLE
 from vaneloop.base import terminal
+from vaneloop.base.tables import read
 from vaneloop.cli import options
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
@@ -35,11 +39,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Write the FMU; return the exit code."""
-    from controller.calibration import CalibrationTable
-    from hil.fmu import is_made, write_fmu
-    from hil.fmu.variables import FIXED, INPUT, OUTPUT, TUNABLE
-    from vaneloop.base.tables import read
-
     machine = options.machine_of(args, strategy=args.strategy)
     if not is_made(args.part, machine.plant, machine.calibration):
         terminal.say(args, "making the source for such a machine (once, about a minute) ...")

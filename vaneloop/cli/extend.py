@@ -6,11 +6,15 @@ import argparse
 import sys
 from dataclasses import replace
 
+from plant import Model
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import check
 from vaneloop.cli import options, own_model
-from vaneloop.cli.options import chain_of
+from vaneloop.cli.chains import chain_of
+from vaneloop.pages.story import falling, floors, word
+from vaneloop.verbs.machine import with_law_files
+from vaneloop.verbs.search import extended, known
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -44,11 +48,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 @options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from plant import Model
-    from vaneloop.pages.story import falling, floors, word
-    from vaneloop.verbs.learn import with_law_files
-    from vaneloop.verbs.search import extended, known
-
     wanted = list(dict.fromkeys(e for group in args.effect for e in group))
     if not wanted:
         raise InputError("extend needs at least one --effect NAME; vaneloop diagnose names candidates")

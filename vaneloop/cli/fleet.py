@@ -12,7 +12,18 @@ from typing import Any
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
+from vaneloop.base.tables import file_of
 from vaneloop.cli import options
+from vaneloop.fleet import report, sources, state, tables
+from vaneloop.fleet.folder import Folder, copies_of
+from vaneloop.fleet.kinds import DIAGNOSIS
+from vaneloop.fleet.leases import BEATS
+from vaneloop.fleet.rent import known, rent
+from vaneloop.fleet.state import state_of
+from vaneloop.fleet.worker import work
+from vaneloop.identification import StageError, load_system
+from vaneloop.identification.user_models.by_log import load_model_of
+from vaneloop.pages.fleet import day, fleet_page
 
 __all__ = ["DESCRIPTION", "add_options", "command", "tell_damaged", "unusable"]
 
@@ -102,12 +113,6 @@ def unusable() -> Iterator[None]:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from vaneloop.fleet import sources, state, tables
-    from vaneloop.fleet.folder import Folder
-    from vaneloop.fleet.kinds import DIAGNOSIS
-    from vaneloop.fleet.leases import BEATS
-    from vaneloop.fleet.rent import known, rent
-
     if not 1 <= args.workers <= 10_000:
         raise InputError(f"--workers (={args.workers}) must be in [1, 10000]")
     if not 0.0 < args.limit <= 1e6:
@@ -133,15 +138,12 @@ def _run(args: argparse.Namespace) -> int:
 
 def _job(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
     """Options of the job, and the files that it needs."""
-    from vaneloop.base import tables
-    from vaneloop.fleet.folder import copies_of
-
     _known_machine(args)
     files = {"tables": args.tables, "model": args.model, "plant": args.plant, "controller": args.controller,
              "system": args.system, "dbc": args.dbc, "mapping": args.mapping}  # fmt: skip
     given = {name: str(f) for name, f in files.items() if f is not None}
     if args.plant:
-        given["plant"] = str(tables.file_of(args.plant))
+        given["plant"] = str(file_of(args.plant))
     reading = options.log_options(args, source="LOGS")
     for in_files in ("dbc", "mapping_file", "tables"):
         reading.pop(in_files, None)
@@ -153,9 +155,6 @@ def _known_machine(args: argparse.Namespace) -> None:
     if not args.system:
         options.machine_of(args)
         return
-    from vaneloop.identification import StageError, load_system
-    from vaneloop.identification.user_models.by_log import load_model_of
-
     for name in ("tables", "plant", "controller"):
         if getattr(args, name):
             raise InputError(f"--{name} does not go with --system")
@@ -168,10 +167,6 @@ def _known_machine(args: argparse.Namespace) -> None:
 
 
 def _work(args: argparse.Namespace) -> int:
-    from vaneloop.fleet.folder import Folder
-    from vaneloop.fleet.leases import BEATS
-    from vaneloop.fleet.worker import work
-
     patience, folder = _patience(args), Folder(args.run)
     options.trusted(args, str(folder.path), folder.code())
     came = work(args.run, every=patience / BEATS, patience=patience, trust=folder.job["machine"])
@@ -184,10 +179,6 @@ def _status(args: argparse.Namespace) -> int:
 
 
 def _report(args: argparse.Namespace) -> int:
-    from vaneloop.fleet import report, tables
-    from vaneloop.fleet.folder import Folder
-    from vaneloop.pages.fleet import day, fleet_page
-
     folder = Folder(args.run)
     limits = report.limits_of(args.limits)
     db = tables.roll_up(folder)
@@ -234,9 +225,6 @@ def _patience(args: argparse.Namespace) -> float:
 
 def _show(args: argparse.Namespace) -> int:
     """Print how far the run is."""
-    from vaneloop.fleet.folder import Folder
-    from vaneloop.fleet.state import state_of
-
     folder = Folder(args.run if args.part != "run" else args.out)
     s = state_of(folder)
     rows = [[status, f"{n:,}"] for status, n in s.came.items()]

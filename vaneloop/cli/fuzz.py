@@ -7,6 +7,7 @@ import argparse
 import numpy as np
 
 from controller import MODES
+from hil.inject import fuzz_tools
 from hil.inject.fuzz import (
     CLAIMS,
     HELD,
@@ -144,8 +145,6 @@ def command(args: argparse.Namespace) -> int:
 
 def _tool(args: argparse.Namespace) -> int:
     """The campaign against what answers tools."""
-    from hil.inject import fuzz_tools
-
     for option in ("replay", "model", "tables", "plant", "controller"):
         if getattr(args, option, None):
             raise InputError(f"--{option} is not for --tool")

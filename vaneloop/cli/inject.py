@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from xml.etree import ElementTree as Xml
 
 from hil.inject.any_controller import SHIPPED, load_reactions
 from hil.inject.injection import cannot, lacks, run
 from hil.inject.scenario import library, load_scenario
 from hil.inject.verdict import Outcome
+from hil.loop.lockstep import warm_up
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import write
@@ -74,8 +76,6 @@ def command(args: argparse.Namespace) -> int:
         )
     machine = options.machine_of(args)
     if args.bus == "lockstep":
-        from hil.loop.lockstep import warm_up
-
         warm_up(lambda text: terminal.say(args, text))
     if args.bus != "lockstep" and (args.controller or args.reactions):
         raise InputError(f"--controller and --reactions are for --bus lockstep; on {args.bus} give vaneloop run yours")
@@ -185,8 +185,6 @@ def _report(args: argparse.Namespace, outcomes: list[Outcome], skipped: list[tup
 
 def _write_junit(file: str, outcomes: list[Outcome], skipped: list[tuple[str, str, str]]) -> None:
     """Write JUnit's XML: a test case a scenario, its claims in the failure's text."""
-    from xml.etree import ElementTree as Xml
-
     broken = sum(not o.held for o in outcomes)
     numbers = {"tests": len(outcomes) + len(skipped), "failures": broken, "errors": 0, "skipped": len(skipped)}
     seconds = f"{sum(o.wall_s for o in outcomes):.3f}"

@@ -10,6 +10,9 @@ from vaneloop.base import terminal
 from vaneloop.base.files import check
 from vaneloop.base.signals import heading
 from vaneloop.cli import options, own_model
+from vaneloop.cli.chains import chain_of
+from vaneloop.verbs.learn import checked_shape, learned, with_path
+from vaneloop.verbs.search import not_given
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -57,15 +60,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 @options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from vaneloop.verbs.learn import checked_shape, learned, with_path
-    from vaneloop.verbs.search import not_given
-
     for path in filter(None, (args.out, args.python)):
         check(path)
     words = " ".join(["vaneloop learn", *sys.argv[2:]])
     checked_shape(args.shape)
     own, asked = own_model.asked(args), {"shape": args.shape, "formulas": not args.curve}
-    chain: Any = None if own else not_given(options.chain_of(args), args.without)
+    chain: Any = None if own else not_given(chain_of(args), args.without)
     with terminal.progress_bar(args, "learning what nobody listed") as tell:
         if own:
             answer = own_model.ask(args, "learn", without=args.without, **asked, progress=tell)

@@ -7,7 +7,9 @@ import sys
 
 from vaneloop.base import terminal
 from vaneloop.cli import options, own_model
-from vaneloop.cli.options import add_machine_options, chain_of, say_located
+from vaneloop.cli.chains import chain_of
+from vaneloop.cli.options import add_machine_options, say_located
+from vaneloop.verbs.search import compared
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -34,8 +36,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 @options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from vaneloop.verbs.search import compared
-
     if own_model.asked(args):
         answer = own_model.ask(args, "locate")
         own_model.show(args, answer.by_log)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from hil.logs.mapping import write_mapping
+from hil.logs.survey import sparkline, survey
 from vaneloop.base import terminal
 from vaneloop.cli import options
 
@@ -32,9 +34,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from hil.logs.mapping import write_mapping
-    from hil.logs.survey import sparkline, survey
-
     reading = options.log_options(args)
     options.warm_up_for(args)
     seen = survey(args.log, **reading)

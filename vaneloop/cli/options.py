@@ -12,7 +12,10 @@ from functools import wraps
 from pathlib import Path
 from typing import Any
 
+from hil.logs import read_log
+from hil.logs.columns import warm_up
 from hil.logs.formats import OURS, is_framed, listed
+from hil.native.isolation import ControllerFailed, isolated
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.verbs.machine import TABLES, Machine, files_of
@@ -27,7 +30,6 @@ __all__ = [
     "add_tables_option",
     "add_trust_option",
     "add_without_option",
-    "chain_of",
     "guarded",
     "log_options",
     "machine_of",
@@ -37,7 +39,6 @@ __all__ = [
     "say_tested",
     "search_bar",
     "tables_of",
-    "tell_search",
     "trusted",
     "warm_up_for",
 ]
@@ -53,37 +54,6 @@ def add_machine_options(parser: Any) -> None:
         help="model file: changed parameters and added effects (written by vaneloop extend)",
     )
     add_tables_option(parser)
-
-
-def tell_search(say: Callable[[str], None]) -> None:
-    """Tell the user that the first search compiles; silent when the compiled code is there already."""
-    from plant.stages import hydraulic_blocks, motor_blocks
-    from vaneloop.base.compiled import is_cached
-
-    if not (is_cached(hydraulic_blocks.run) or is_cached(motor_blocks.run)):
-        say("compiling the stages of the search for this machine (once, about 30 s) ...")
-
-
-def chain_of(args: argparse.Namespace, model: Any = None, loop: bool = False) -> Any:
-    """Read the log that ``args`` name and put it into stages of the machine that ``model`` (default: ``args.model``)
-    describes.
-
-    loop  the command simulates the whole loop, too: compiled first, where it is not
-    """
-    from vaneloop.verbs.parts import bind_parts, split
-
-    machine = machine_of(args, model)
-    own_parts = split([x for group in getattr(args, "fit", ()) for x in group], parts_to_test(args))[:2]
-    log = read_log_of(args, require=())
-    if loop:
-        from hil.loop.lockstep import warm_up
-
-        warm_up(lambda text: terminal.say(args, text))
-    tell_search(lambda text: terminal.say(args, text))
-    chain = bind_parts(machine, log, *own_parts)
-    for note in chain.notes:
-        terminal.say(args, f"note: {note}")
-    return chain
 
 
 @contextmanager
@@ -223,8 +193,6 @@ def guarded(command: Callable[[argparse.Namespace], int]) -> Callable[[argparse.
                     f"--save-crash {args.save_crash}: needs --controller; the firmware here does not crash"
                 )
             return command(args)
-        from hil.native.isolation import ControllerFailed, isolated
-
         if args.save_crash is not None and not args.save_crash.endswith(".parquet"):
             raise InputError(f"--save-crash {args.save_crash}: must end with .parquet")
         try:
@@ -298,8 +266,6 @@ def log_options(args: argparse.Namespace, source: str | None = None) -> dict[str
 
 def read_log_of(args: argparse.Namespace, require: tuple[str, ...] = ("n_dem",)) -> Any:
     """Read the log that ``args`` name; tell before code is compiled for it."""
-    from hil.logs import read_log
-
     options = log_options(args)
     warm_up_for(args)
     return read_log(args.log, **options, require=require)
@@ -308,6 +274,4 @@ def read_log_of(args: argparse.Namespace, require: tuple[str, ...] = ("n_dem",))
 def warm_up_for(args: argparse.Namespace) -> None:
     """Compile what cuts signals out of frames, and say so, where the log holds frames."""
     if is_framed(Path(str(args.log))):
-        from hil.logs.columns import warm_up
-
         warm_up(lambda text: terminal.say(args, text))

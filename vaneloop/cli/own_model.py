@@ -6,8 +6,17 @@ import argparse
 from collections.abc import Callable
 from typing import Any
 
+from plant import Model
 from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
+from vaneloop.base.spans import is_span
 from vaneloop.cli import options
+from vaneloop.identification import StageError, load_system
+from vaneloop.identification.user_models.by_log import load_model_of
+from vaneloop.pages.by_log import heads, short_names
+from vaneloop.verbs import learn, search
+from vaneloop.verbs.parts import split
+from vaneloop.verbs.search import read_record
 
 __all__ = ["add_options", "ask", "asked", "show", "system_of"]
 
@@ -42,9 +51,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def asked(args: argparse.Namespace) -> bool:
     """Whether the user brought a model; refuses options that only then make sense."""
-    from vaneloop.base.errors import InputError
-    from vaneloop.base.spans import is_span
-
     if not args.system:
         logs = [name for name in options.parts_to_test(args) if not is_span(name)]
         for name, given in (("also", args.also), ("test", logs)):
@@ -61,20 +67,11 @@ def asked(args: argparse.Namespace) -> bool:
 
 def system_of(args: argparse.Namespace) -> Any:
     """The user's model."""
-    from vaneloop.identification import load_system
-
     return load_system(args.system)
 
 
 def ask(args: argparse.Namespace, verb: str, **more: Any) -> Any:
     """Ask ``verb`` of `vaneloop.verbs` of the user's model on the logs that ``args`` name; return its answer."""
-    from plant import Model
-    from vaneloop.base.errors import InputError
-    from vaneloop.identification import StageError, load_system
-    from vaneloop.identification.user_models.by_log import load_model_of
-    from vaneloop.verbs import learn, search
-    from vaneloop.verbs.parts import split
-
     ask_it: Callable[..., Any] = learn.learn if verb == "learn" else getattr(search, verb)
     try:
         system = load_system(args.system)
@@ -97,8 +94,6 @@ def ask(args: argparse.Namespace, verb: str, **more: Any) -> Any:
 
 def _record(args: argparse.Namespace, system: Any, path: str) -> Any:
     """One log as the system wants it: by its own reader, or by ours."""
-    from vaneloop.verbs.search import read_record
-
     record, notes = read_record(path, system, **({} if system.read else options.log_options(args)))
     for note in notes:
         terminal.say(args, f"note: {note}")
@@ -107,8 +102,6 @@ def _record(args: argparse.Namespace, system: Any, path: str) -> Any:
 
 def show(args: argparse.Namespace, by_log: Any) -> None:
     """Print what is to note, each log's error after each step, and the model's own parameters."""
-    from vaneloop.pages.by_log import heads, short_names
-
     d = by_log.d
     for note in by_log.notes:
         terminal.say(args, f"note: {note}")

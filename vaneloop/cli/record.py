@@ -6,7 +6,13 @@ import argparse
 import time
 from typing import Any
 
+from can import CanError
+
+from hil.bus.port import Port
+from hil.logs.recorder import Recorder, check_name, packed_message
+from hil.loop.realtime import stop_on_signals
 from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
 from vaneloop.cli import station
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
@@ -35,13 +41,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from can import CanError
-
-    from hil.bus.port import Port
-    from hil.logs.recorder import Recorder, check_name, packed_message
-    from hil.loop.realtime import stop_on_signals
-    from vaneloop.base.errors import InputError
-
     station.check_seconds(args, "duration")
     check_name(args.out)
     name = station.bus_name(args)

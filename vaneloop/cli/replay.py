@@ -6,11 +6,17 @@ import argparse
 import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from hil.logs import Channel, write_log
 from hil.logs.formats import OURS, listed
+from hil.loop.lockstep import warm_up
+from hil.native import Program, crash_log
+from hil.native.crash_log import is_crash_log
 from hil.replay import STAGE, STATISTICS, ReplayResult
 from vaneloop.base import terminal
+from vaneloop.base.errors import InputError, meant
 from vaneloop.cli import options
 from vaneloop.verbs.replay import replay
 
@@ -55,18 +61,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 @options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    if args.controller is not None:
-        from hil.native.crash_log import is_crash_log
-
-        if is_crash_log(args.log):
-            return _crash_again(args)
+    if args.controller is not None and is_crash_log(args.log):
+        return _crash_again(args)
     return replayed(args)
 
 
 def _crash_again(args: argparse.Namespace) -> int:
     """Run a controller on the inputs on which one failed before; where it fails again, that ends this process."""
-    from hil.native import Program, crash_log
-
     rows, about, calibration = crash_log.read(args.log)
     terminal.say(args, f"{args.log}: {len(rows):,} ticks from power-on; then: {about['failure']}")
     crash_log.feed(rows, calibration, Program(args.controller))
@@ -84,16 +85,10 @@ def replayed(
     """Run replay from parsed options; ``extra`` goes into the JSON too, ``floors`` as in `replay`, notes that have been
     ``said`` are not said again. Return the exit code.
     """
-    from pathlib import Path
-
-    from hil.logs import Channel, write_log
-
     limits = _limits(args.tolerance)
     options.tables_of(args, tell=True)
     machine = options.machine_of(args, strategy=args.strategy)  # refuse a wrong name or table before reading a long log
     log = options.read_log_of(args)
-    from hil.loop.lockstep import warm_up
-
     warm_up(lambda text: terminal.say(args, text))
     with terminal.progress_bar(args, f"replaying {Path(args.log).name}") as progress:
         answer = replay(log, machine, progress=progress, floors=floors)
@@ -135,8 +130,6 @@ def _figure(v: float | None) -> str:
 
 def _limits(options: list[str]) -> dict[tuple[str, str], float]:
     """Parse ``--tolerance`` into {(signal, statistic): limit}."""
-    from vaneloop.base.errors import InputError, meant
-
     out = {}
     for key, text in terminal.pairs(options, "tolerance").items():
         signal, _, statistic = key.partition(".")
@@ -157,8 +150,6 @@ def _limits(options: list[str]) -> dict[tuple[str, str], float]:
 
 def _exceeded(result: ReplayResult, limits: dict[tuple[str, str], float]) -> list[str]:
     """Tolerances that are exceeded, in words. The measurement decides; the schedule where nothing was measured."""
-    from vaneloop.base.errors import InputError
-
     out = []
     for (signal, statistic), limit in limits.items():
         of = [s for s in result.signals if s.signal == signal]

@@ -3,10 +3,31 @@
 from __future__ import annotations
 
 import argparse
+import time
 from typing import Any
 
+import numpy as np
+
+from controller import FAULTS
+from hil.bus.frames import AUTH_NAMES, ECU_DEMAND, FRESHNESS, HEAD_MASK, IDENT_MASK, NAMES, PAUSE, PREPARED
+from hil.bus.lockstep_bus import run_lockstep
+from hil.bus.port import Port
+from hil.bus.wire import BIT_RATE, BITS_PER_TICK
+from hil.calibrate.station import replay_attended
+from hil.fmu.plant_fmu import PlantFmu, PlantNode
+from hil.logs.recorder import Recorder, check_name
+from hil.logs.recordings import read_record
+from hil.loop.node import Ecu, Node, replay
+from hil.loop.realtime import Ticker, packed, run_realtime, stop_on_signals, wall_clock
+from hil.loop.secured import run_secured
+from hil.native.program import observables
+from plant import build_plant
+from plant.effects import rows_at
+from plant.parameters import ACCELERATION, DECELERATION, LAG
 from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
 from vaneloop.cli import attended, options, station
+from vaneloop.cli.ecu import demand_of
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -91,8 +112,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 @options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from vaneloop.base.errors import InputError
-
     station.check_realtime_options(args)
     if args.limit_late_us is not None and not args.limit_late_us >= 0.0:
         raise InputError(f"--limit-late-us (={args.limit_late_us:g}) must be 0 or more")
@@ -110,8 +129,6 @@ def command(args: argparse.Namespace) -> int:
     elif args.plant_map:
         raise InputError("--plant-map names variables of an FMU: it needs --plant X.fmu")
     if args.record:
-        from hil.logs.recorder import check_name
-
         check_name(args.record)
     name = station.bus_name(args)
     lockstep = name.partition(":")[0] == "lockstep"
@@ -132,13 +149,9 @@ def command(args: argparse.Namespace) -> int:
 
 
 def _node(args: argparse.Namespace, machine: Any = None) -> Any:
-    from hil.loop.node import Node
-
     machine = machine or options.machine_of(args)
     station.warm_nodes(args)
     if args.plant_fmu is not None:
-        from hil.fmu.plant_fmu import PlantFmu, PlantNode
-
         mapping = terminal.pairs(args.plant_map, "plant-map")
         fmu = PlantFmu(args.plant_fmu, machine.plant.vanes, mapping, n_r=args.start_speed)
         for note in fmu.notes:
@@ -149,10 +162,6 @@ def _node(args: argparse.Namespace, machine: Any = None) -> Any:
 
 def _say_engine(args: argparse.Namespace, machine: Any, bus: str) -> None:
     """Say where the model's changed engine runs: in the ECU, which is another program here."""
-    from plant import build_plant
-    from plant.effects import rows_at
-    from plant.parameters import ACCELERATION, DECELERATION, LAG
-
     rows = [LAG, ACCELERATION, DECELERATION, *rows_at("engine")]
     if args.model and (machine.plant.p[rows] != build_plant().p[rows]).any():
         terminal.say(
@@ -161,12 +170,8 @@ def _say_engine(args: argparse.Namespace, machine: Any, bus: str) -> None:
 
 
 def _node_json(node: Any) -> dict[str, Any]:
-    from controller import FAULTS
-
     faults = [name for bit, name in enumerate(FAULTS) if node.faults >> bit & 1]
     n_dem = float(node.loop.state.n_dem)
-    from hil.native.program import observables
-
     own = observables(node.loop.foreign)
     return {
         **({"own": own} if own else {}),
@@ -209,9 +214,6 @@ def _say_node(args: argparse.Namespace, node: Any) -> None:
 
 
 def _in_real_time(args: argparse.Namespace, name: str) -> int:
-    from hil.bus.port import Port
-    from hil.loop.realtime import Ticker, run_realtime, stop_on_signals, wall_clock
-
     authenticator = station.authenticator(args)
     machine = options.machine_of(args)
     node = _node(args, machine)
@@ -299,16 +301,6 @@ def _record_json(args: argparse.Namespace, recorder: Any, exceeded: list[str]) -
 
 
 def _in_lockstep(args: argparse.Namespace) -> int:
-    import time
-
-    import numpy as np
-
-    from hil.bus.frames import ECU_DEMAND, IDENT_MASK
-    from hil.bus.lockstep_bus import run_lockstep
-    from hil.bus.wire import BIT_RATE, BITS_PER_TICK
-    from hil.loop.node import Ecu, replay
-    from vaneloop.cli.ecu import demand_of
-
     authenticator = station.authenticator(args)
     notes: list[str] = []
     demand = demand_of(args, notes, default="ramp")
@@ -321,8 +313,6 @@ def _in_lockstep(args: argparse.Namespace) -> int:
     start, whole = time.time_ns() // 10**9 * 1000, None
     with terminal.progress_bar(args, "lockstep") as progress:
         if authenticator is not None:
-            from hil.loop.secured import run_secured
-
             other = station.secured(ecu, authenticator, ecu=True)
             whole = run_secured(profile, secured, other, start=start, duration=duration, progress=progress)
             run = whole.run
@@ -366,15 +356,6 @@ def _in_lockstep(args: argparse.Namespace) -> int:
 
 
 def _repeat(args: argparse.Namespace) -> int:
-    import time
-
-    import numpy as np
-
-    from hil.bus.frames import AUTH_NAMES, FRESHNESS, HEAD_MASK, NAMES, PAUSE, PREPARED
-    from hil.logs.recordings import read_record
-    from hil.loop.node import replay
-    from vaneloop.base.errors import InputError
-
     authenticator = station.authenticator(args)
     record = read_record(args.inputs)
     secured = bool((record.rows[:, 0] == FRESHNESS).any())
@@ -410,8 +391,6 @@ def _repeat(args: argparse.Namespace) -> int:
         terminal.say(args, f"note: {notes[0]}")
     whole = station.secured(attended.attend(args, node, recorded=True), authenticator)
     if whole is not node:
-        from hil.calibrate.station import replay_attended
-
         at, sent = replay_attended(whole, tick[taken], received, ticks)
     else:
         at, sent = replay(node, tick[taken], received, ticks)
@@ -465,11 +444,6 @@ def _write_record(
     """Record a run in lockstep as one in real time is: frames taken and sent, with their ticks; ``start`` in ms since
     1970.
     """
-    import numpy as np
-
-    from hil.logs.recorder import Recorder
-    from hil.loop.realtime import packed
-
     recorder = Recorder(args.record, "lockstep")
     if recorder.kept is not None:
         terminal.say(args, f"{args.record} was there already: it is now {recorder.kept}")

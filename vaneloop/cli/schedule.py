@@ -8,8 +8,13 @@ import argparse
 import sys
 from typing import Any
 
+from plant import load_geometry, load_schedules
 from vaneloop.base import terminal
 from vaneloop.cli import options
+from vaneloop.design.links import ScheduleOptions
+from vaneloop.design.schedule_files import result_json, write_tables
+from vaneloop.design.scheduling import schedule
+from vaneloop.pages.schedule import schedule_page
 
 __all__ = ["DESCRIPTION", "add_options", "command", "log_of"]
 
@@ -90,11 +95,6 @@ def log_of(args: argparse.Namespace) -> Any:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from plant import load_geometry, load_schedules
-    from vaneloop.design.links import ScheduleOptions
-    from vaneloop.design.schedule_files import result_json, write_tables
-    from vaneloop.design.scheduling import schedule
-
     adjust = () if args.adjust == "none" else tuple(a.strip() for a in args.adjust.split(","))
     options = ScheduleOptions(args.step, args.lb_range, args.lc_range, adjust, args.criterion, args.limit)
     options.check()
@@ -166,8 +166,6 @@ def command(args: argparse.Namespace) -> int:
         terminal.say(args, "tables: " + ", ".join(str(p) for p in write_tables(result, args.out)))
     terminal.write_json(args, result_json(result))
     if args.report:
-        from vaneloop.pages.schedule import schedule_page
-
         terminal.say(
             args, f"page: {schedule_page(result, args.report, ' '.join(['vaneloop schedule', *sys.argv[2:]]))}"
         )

@@ -5,7 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 
+import numpy as np
+
+from plant import load_geometry
 from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
 from vaneloop.design.spatial import spatial_check
 from vaneloop.pages.mechanism import spatial_page
 
@@ -44,11 +48,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    import numpy as np
-
-    from plant import load_geometry
-    from vaneloop.base.errors import InputError
-
     if not args.limit >= 0.0:
         raise InputError(f"--limit (={args.limit:g} deg) must be 0 or more")
     geometry = load_geometry(args.geometry)

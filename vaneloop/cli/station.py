@@ -9,11 +9,22 @@ import queue
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from hil.bus.port import open_bus
+from hil.bus.secoc import Authenticator, read_key
 from hil.logs.formats import OURS, spoken
+from hil.logs.recorder import RecorderProcess
+from hil.loop import realtime
+from hil.loop.node import Ecu, Node, node_tick
+from hil.loop.secured import DEMANDED, FROM_CONTROLLER, Secured
 from vaneloop.base import terminal
+from vaneloop.base.compiled import is_cached
+from vaneloop.base.errors import InputError
 
 __all__ = [
     "ACCEPTED", "A_RECORDING", "BUS_HELP", "BusWatch", "Live", "add_realtime_options", "add_secoc_option",
@@ -64,8 +75,6 @@ def authenticator(args: argparse.Namespace) -> Any:
     """Return what makes and checks MACs under the key of ``--secoc``; None without it."""
     if args.secoc is None:
         return None
-    from hil.bus.secoc import Authenticator, read_key
-
     return Authenticator(read_key(args.secoc))
 
 
@@ -75,8 +84,6 @@ def secured(node: Any, authenticator: Any, *, ecu: bool = False, clock: Callable
     """
     if authenticator is None:
         return node
-    from hil.loop.secured import DEMANDED, FROM_CONTROLLER, Secured
-
     return Secured(node, authenticator, FROM_CONTROLLER if ecu else DEMANDED, clock)
 
 
@@ -103,8 +110,6 @@ def say_authentication(args: argparse.Namespace, node: Any, unauthentic: int) ->
 
 def check_realtime_options(args: argparse.Namespace) -> None:
     """Refuse values that cannot be. Raises InputError."""
-    from vaneloop.base.errors import InputError
-
     if args.realtime_priority is not None and not 1 <= args.realtime_priority <= 99:
         raise InputError(f"--realtime-priority (={args.realtime_priority}) must be in [1, 99]")
     if not 0.0 <= args.spin_us <= 1000.0:
@@ -117,8 +122,6 @@ def check_realtime_options(args: argparse.Namespace) -> None:
 
 def check_seconds(args: argparse.Namespace, *names: str) -> None:
     """Refuse times that cannot be. Raises InputError."""
-    from vaneloop.base.errors import InputError
-
     for name in names:
         value = getattr(args, name)
         if value is not None and not 0.0 < value <= 1e7:
@@ -128,9 +131,6 @@ def check_seconds(args: argparse.Namespace, *names: str) -> None:
 @contextlib.contextmanager
 def undisturbed(args: argparse.Namespace) -> Iterator[list[str]]:
     """`hil.loop.realtime.undisturbed` from options; a refusal is one line."""
-    from hil.loop import realtime
-    from vaneloop.base.errors import InputError
-
     with contextlib.ExitStack() as stack:
         try:
             notes = stack.enter_context(realtime.undisturbed(args.realtime_priority, args.cpu))
@@ -154,8 +154,6 @@ def joined(name: str, priority: int | None = None, **options: Any) -> Iterator[A
     """Open the bus and leave it at the end. The broker of an embedded bus works with this participant's real-time
     priority.
     """
-    from hil.bus.port import open_bus
-
     if name.partition(":")[0] == "local":
         options["priority"] = priority or 0
     bus = open_bus(name, **options)
@@ -167,11 +165,6 @@ def joined(name: str, priority: int | None = None, **options: Any) -> Iterator[A
 
 def warm_nodes(args: argparse.Namespace) -> None:
     """Compile the nodes' ticks, saying so before a wait of some seconds."""
-    import numpy as np
-
-    from hil.loop.node import Ecu, Node, node_tick
-    from vaneloop.base.compiled import is_cached
-
     if not is_cached(node_tick):
         terminal.say(args, "compiling the nodes for this machine (once, about 20 s) ...")
     nothing = np.zeros((1, 2), np.int64)
@@ -185,8 +178,6 @@ def recording(args: argparse.Namespace, channel: str) -> Iterator[Any]:
     if not args.record:
         yield None
         return
-    from hil.logs.recorder import RecorderProcess
-
     recorder = RecorderProcess(args.record, channel.replace(":", "-"))
     if recorder.kept:
         terminal.say(args, f"{args.record} was there already: it is now {recorder.kept}")
@@ -286,8 +277,6 @@ class BusWatch:
 
 def realtime_json(report: Any) -> dict[str, Any]:
     """Return the lateness part of a command's JSON."""
-    from datetime import UTC, datetime
-
     begin = report.begin
     t = begin.worst_tick * 1e-3
     at = datetime.fromtimestamp(report.started_ns * 1e-9 + t, UTC).isoformat()
@@ -310,8 +299,6 @@ def realtime_json(report: Any) -> dict[str, Any]:
 
 def print_lateness(args: argparse.Namespace, report: Any) -> None:
     """Print how late the ticks were."""
-    from datetime import datetime
-
     if not report.ticks:
         return
     rows = []

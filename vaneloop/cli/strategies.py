@@ -12,6 +12,7 @@ from typing import Any
 
 from controller import STRATEGIES
 from hil.engine_test import load_profile
+from hil.loop.lockstep import warm_up
 from plant import build_plant
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
@@ -85,8 +86,6 @@ def _checked(args: argparse.Namespace) -> None:
 @options.guarded
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from hil.loop.lockstep import warm_up
-
     _checked(args)
     files = options.tables_of(args)
     plant = build_plant(files["plant"], files["geometry"], files["schedules"])

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from hil.logs import LogError
 from vaneloop.base.compiled import compiled
@@ -182,7 +182,9 @@ def _fit(
     n_drift = 0
     if loops.size > 2:  # one knot a loop: more could follow the passes, and would take the curve's slope for drift
         n_drift = loops.size
-        parts.append(CubicSpline(loops, np.eye(n_drift), bc_type="natural")(np.clip(ton, loops[0], loops[-1])))
+        parts.append(
+            scipy.interpolate.CubicSpline(loops, np.eye(n_drift), bc_type="natural")(np.clip(ton, loops[0], loops[-1]))
+        )
     for i in range(1, m - 1):
         prior.append((row((i - 1, 1.0), (i, -2.0), (i + 1, 1.0)), 0.0, 0.03))
         prior.append((row((m + i - 1, 1.0), (m + i, -2.0), (m + i + 1, 1.0)), 0.0, 0.03))

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from hil.logs import Channel, LogError
 from plant import Geometry
@@ -280,7 +279,9 @@ def _equivalent(geometry: Geometry, k: int, stroke: Array, ring: Array, scale: f
         return np.concatenate([(model - ring) / math.sqrt(stroke.size), 0.003 * change])
 
     low = [-0.8 * stage.lb.value, -0.2 * stage.lc.value]
-    change = least_squares(residual, np.zeros(2), bounds=(low, [200.0, 200.0]), diff_step=1e-4, x_scale=[1.0, 1.0]).x
+    change = scipy.optimize.least_squares(
+        residual, np.zeros(2), bounds=(low, [200.0, 200.0]), diff_step=1e-4, x_scale=[1.0, 1.0]
+    ).x
     return stage.lb.value + float(change[0]), stage.lc.value + float(change[1])
 
 

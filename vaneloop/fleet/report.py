@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-from scipy import stats
+import scipy
 
 from vaneloop.base.errors import InputError
 from vaneloop.fleet.sources import text_table
@@ -107,7 +107,7 @@ def _lacks(db: duckdb.DuckDBPyConnection) -> list[dict[str, Any]]:
     out = []
     for engine, effect, stage, named, probability, first, last, key, logs, missed in rows:
         able = max(logs - missed, named)
-        chance = float(stats.binom.sf(named - 1, able, FALSE))
+        chance = float(scipy.stats.binom.sf(named - 1, able, FALSE))
         out.append({
             "engine": engine, "effect": effect, "stage": stage, "named": named, "able": able, "share": named / able,
             "probability": probability, "first": first, "last": last, "chance": chance, "key": key,

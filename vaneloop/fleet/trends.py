@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from vaneloop.base.extras import needed
 
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 Kind = Literal["none", "growth", "step", "too few"]
 LEAST = 8  # logs of an engine, below which nothing is said of change
 LEVEL = 0.9  # of all intervals
-HALF = float(stats.norm.ppf(0.5 + LEVEL / 2))  # of such an interval, over a standard deviation
+HALF = float(scipy.special.ndtri(0.5 + LEVEL / 2))  # of such an interval, over a standard deviation
 SURE = 1e-3  # probability of so good a fit without any change, below which a change is said to be there
 HORIZON = 100.0  # years beyond which nobody asks
 ODD = 0.01  # of the healthy engines that may be accused, at most
@@ -103,9 +103,9 @@ def trend(t: Array, y: Array, s: Array, sure: float = SURE, told: NDArray[np.boo
     left = float(fits[kind][:, 3].min())
     # three numbers against one; two shapes, and T chosen among many, make chance fits six times as probable (simulated)
     gain = (rest - left) / 3.0 / max(left / (n - 3), 1e-300)
-    p = min(1.0, 6.0 * float(stats.f.sf(gain, 3, n - 3)))
+    p = min(1.0, 6.0 * float(scipy.stats.f.sf(gain, 3, n - 3)))
     if p >= sure or not _by_ruptures(t, y):
-        half = float(stats.t.ppf(0.5 + LEVEL / 2, n - 1) * np.sqrt(rest / (n - 1) / w.sum()))
+        half = float(scipy.stats.t.ppf(0.5 + LEVEL / 2, n - 1) * np.sqrt(rest / (n - 1) / w.sum()))
         return Trend("none", n, level, level, level - half, level + half, p=p, scatter=b)
     return _changed(kind, p, b, t, y, w, fits[kind], told)
 
@@ -126,9 +126,9 @@ def _changed(
     freedom = max(int(told.sum()) - (3 if told.all() else 2), 1)
     squares = float(np.sum((w * (y - line) ** 2)[told]))
     sigma2 = squares / freedom  # of weight 1: 1 where logs scatter as they say of themselves
-    room = float(stats.f.ppf(LEVEL, 1, freedom)) - (fits[:, 3] - left) / max(sigma2, 1e-300)
+    room = float(scipy.stats.f.ppf(LEVEL, 1, freedom)) - (fits[:, 3] - left) / max(sigma2, 1e-300)
     kept, q = fits[room >= 0.0], np.sqrt(room[room >= 0.0])
-    most = squares / float(stats.chi2.ppf(1.0 - LEVEL, freedom))  # scatter that chance allows
+    most = squares / float(scipy.stats.chi2.ppf(1.0 - LEVEL, freedom))  # scatter that chance allows
     alike = np.sqrt(max(1.0 - most, 0.0) * told.sum() / w[told].sum())
     full = np.maximum(t[-1] - kept[:, 0], 1e-9) if kind == "growth" else np.ones(len(kept))
     wrong = np.column_stack([np.full(len(kept), alike), alike / np.sqrt(told.sum()) / full]) * HALF
@@ -202,7 +202,7 @@ def odd(values: Sequence[float] | Array, spread: Sequence[float] | Array | None 
         width = float(np.hypot(scale * np.sqrt(1.0 + 1.57 / len(others)), own))
         if width > 0.0:
             freedom = max(0.37 * (len(others) - 1), 2.0)
-            out[i] = min(1.0, 2.0 * float(stats.t.sf(abs(v[i] - centre) / width, freedom)) * tests)
+            out[i] = min(1.0, 2.0 * float(scipy.stats.t.sf(abs(v[i] - centre) / width, freedom)) * tests)
         elif v[i] != centre:
             out[i] = 0.0
     return out

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
 from vaneloop.identification.results import rms_per_output
@@ -258,13 +259,13 @@ def stands_out(
     n, square, floor  samples, sum of squares in noise floors, and the sum to be expected, each float64[bins, blocks]
     known             mean square up to which an error may be noise, in squared noise floors
     """
-    from scipy.special import ndtri
-
     worst = (np.arange(len(n)), np.argmax(square - floor, axis=1))
     whole = _mean(*(x.sum(axis=1) for x in (n, square, floor)))
     rest = _mean(*(x.sum(axis=1) - x[worst] for x in (n, square, floor)))
     z, confirmed = ((ms / known - 1.0) * np.sqrt(np.maximum(m, 1) / (2.0 * correlation)) for m, ms in (whole, rest))
-    return (z > -ndtri(LEVEL / max(looks, 1))) & (confirmed > -ndtri(LEVEL)) & (whole[0] > 20), *whole
+    return (z > -scipy.special.ndtri(LEVEL / max(looks, 1))) & (confirmed > -scipy.special.ndtri(LEVEL)) & (
+        whole[0] > 20
+    ), *whole
 
 
 def _mean(n: Array, squares: Array, floor: Array) -> tuple[Array, Array]:
@@ -335,8 +336,6 @@ def shape(judge: LeastSquaresProblem, fit: Fit, noise: float = 1.0) -> list[Shap
     For a stage that integrates, the slope of the error is described (an effect there adds speed); else the error
     itself.
     """
-    from scipy.signal import periodogram
-
     stage = judge.stage
     e = judge.errors(fit.theta[None])[0] * judge.floor[:, None]
     t = stage.t
@@ -351,7 +350,7 @@ def shape(judge: LeastSquaresProblem, fit: Fit, noise: float = 1.0) -> list[Shap
         # told at the windows' own rate, at which each of them starts alike
         whole = without_jumps(stage, stage.measured[o] - stage.run(fit.theta[None])[0, o])
         rate = np.diff(whole) / dt
-        f, power = periodogram(np.where(np.isfinite(rate), rate, 0.0), 1.0 / dt)
+        f, power = scipy.signal.periodogram(np.where(np.isfinite(rate), rate, 0.0), 1.0 / dt)
         power[1:] /= (2.0 * np.sin(np.pi * f[1:] * dt) / dt) ** 2
         resolution = max(0.05 / second, 3.0 / (t[-1] - t[0]))
         keep = f > 0.7 / second

@@ -6,6 +6,8 @@ import html
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vaneloop.pages.style import painted
+
 if TYPE_CHECKING:
     import plotly.graph_objects
 
@@ -38,8 +40,6 @@ class Answer:
     def plot(self, which: int = 0) -> plotly.graph_objects.Figure:
         """A picture of the page, the first by default, as a plotly figure."""
         import plotly.graph_objects as go
-
-        from vaneloop.pages.style import painted
 
         figures = self.page().figures
         return go.Figure(painted(figures[which]) if figures else {})

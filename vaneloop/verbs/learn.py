@@ -7,21 +7,43 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from plant import write_model
+from plant.model import Learned as Table
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import write
 from vaneloop.identification import StageError, System
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.results import answer_of, found_of, recalibrated, rms_of
+from vaneloop.identification.selection.relative_error_acceptance import HARM, LEAST_FALL, UNKNOWN
+from vaneloop.identification.unmodelled.curve_candidates import SHAPES, UserModelCandidates, on_logs
+from vaneloop.identification.unmodelled.fitted_candidate import Outcome
+from vaneloop.identification.unmodelled.learned_law import law_of
+from vaneloop.identification.unmodelled.learned_surface import LearnedSurface, surface_law_of
+from vaneloop.identification.unmodelled.learning import CurveSearch
+from vaneloop.identification.unmodelled.likelihood_acceptance import above_the_noise
+from vaneloop.identification.unmodelled.parametric_substitution import spoken
+from vaneloop.identification.unmodelled.python_law import python_law
+from vaneloop.identification.unmodelled.python_surface import python_surface
+from vaneloop.identification.unmodelled.surface_candidates import SurfaceCandidate
+from vaneloop.identification.unmodelled.surface_closed_forms import as_the_law, reach_of
+from vaneloop.identification.user_models.by_log import ByLog, as_given, bind
+from vaneloop.identification.vane_chain.candidates import VaneChainCandidates
+from vaneloop.pages.learned import learned_page
+from vaneloop.pages.story import floors
+from vaneloop.pages.style import capital
 from vaneloop.verbs.answer import Answer
 from vaneloop.verbs.machine import Machine
-from vaneloop.verbs.search import Diagnosed, diagnose, with_fits
+from vaneloop.verbs.search import Diagnosed, chain_for, diagnose, not_given, with_fits
 from vaneloop.verbs.search import diagnosed as of_chain
 
 if TYPE_CHECKING:
     from plant import Model
-    from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
+    from vaneloop.identification.least_squares.problem import Fit
     from vaneloop.identification.results import StageDiagnosis
-    from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate, Outcome
+    from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
     from vaneloop.identification.unmodelled.learned_law import LearnedLaw
-    from vaneloop.identification.user_models.by_log import ByLog
     from vaneloop.identification.vane_chain.chain import Chain
     from vaneloop.pages.page import Page
 
@@ -64,9 +86,6 @@ class Learned(Answer):
             if self.verdict == "unknown" and self.steps:
                 said = "A reading lacks bits"
             return f"{said}: {self.outcome.why}."
-        from vaneloop.pages.story import floors
-        from vaneloop.pages.style import capital
-
         text = "; ".join(law.sentence() for law in self.laws)
         before, after = self.laws[0].error_before, self.laws[-1].error_after
         return f"{capital(text)}. Held-out error in noise floors: {floors(before)} to {floors(after)}."
@@ -97,14 +116,10 @@ class Learned(Answer):
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
-        from vaneloop.pages.learned import learned_page
-
         return learned_page(self.laws, self.outcome, self.sentence(), self.notes, self.by_log, command, self.log)
 
     def write(self, path: str | Path) -> Path:
         """Write the model with its laws, a file that ``extend --effect`` and ``--model`` take; return its path."""
-        from plant import write_model
-
         assert self.model is not None
         write_model(str(path), self.model)
         return Path(path)
@@ -115,10 +130,6 @@ class Learned(Answer):
         system  the user's own model, to whose ``laws`` it can be added, or which calls it, of a difference; None: of
                 the vane chain, the function alone, as always where it is one of two quantities
         """
-        from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
-        from vaneloop.identification.unmodelled.python_law import python_law
-        from vaneloop.identification.unmodelled.python_surface import python_surface
-
         law = self.laws[0]
         text = python_surface(law) if isinstance(law, LearnedSurface) else python_law(law, system)
         return write(path, text)
@@ -137,24 +148,6 @@ def law_json(law: LearnedLaw) -> dict[str, Any]:
         ],
         "untold": law.untold, "trades": law.trades, "rivals": law.rivals, **law.more(),
     }  # fmt: skip
-
-
-def with_law_files(effects: Sequence[str], machine: Machine) -> tuple[list[str], Model]:
-    """Effects with those of law files (``X.toml``) by their names, and the machine's model with these laws."""
-    from plant import load_model
-
-    added, wanted = machine.added, []
-    for e in effects:
-        if not e.endswith(".toml"):
-            wanted.append(e)
-            continue
-        law = load_model(e, machine.plant)
-        if not law.curves:
-            raise InputError(f"--effect {e}: has no table curves; allowed: a law file of vaneloop learn")
-        wanted += list(law.curves)
-        own = {name: law.effects.get(name, {}) for name in law.curves}
-        added = added.model_copy(update={"curves": {**added.curves, **law.curves}, "effects": {**added.effects, **own}})
-    return wanted, added
 
 
 def learn(
@@ -180,8 +173,6 @@ def learn(
     """
     tell, shape = progress or (lambda _: None), checked_shape(shape)
     if not isinstance(model, System):
-        from vaneloop.verbs.search import chain_for, not_given
-
         machine = model or Machine()
         chain, name = chain_for(log, machine, fit, test)
         return learned(not_given(chain, without), name, machine.added, workers, tell, None, shape, formulas)
@@ -211,12 +202,6 @@ def learned(
     found     the diagnosis of this log, where that has been made
     formulas  whether a formula that does as well as its curve is the law
     """
-    from vaneloop.identification.unmodelled.fitted_candidate import Outcome
-    from vaneloop.identification.unmodelled.learned_law import law_of
-    from vaneloop.identification.unmodelled.learning import CurveSearch
-    from vaneloop.identification.unmodelled.parametric_substitution import spoken
-    from vaneloop.identification.vane_chain.candidates import VaneChainCandidates
-
     tell = progress or (lambda _: None)
     shape = checked_shape(shape)
     begun = 0.0 if found else 0.4
@@ -272,9 +257,6 @@ def learned(
 
 def _open(chain: Chain, d: StageDiagnosis) -> bool:
     """Whether a stage may lack a law that nobody listed: its error is more than noise, and no law has a name for it."""
-    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
-    from vaneloop.identification.unmodelled.likelihood_acceptance import above_the_noise
-
     stage = chain.stage(d.stage)
     if stage.made is None or d.verdict == "missing":
         return False
@@ -283,16 +265,12 @@ def _open(chain: Chain, d: StageDiagnosis) -> bool:
 
 def _with_stage(model: Model, judge: LeastSquaresProblem, fit: Fit) -> Model:
     """The model with a stage's own parameters as they were fitted."""
-    from vaneloop.identification.results import recalibrated
-
     moved = {str(r["parameter"]): float(str(r["value"])) for r in recalibrated(judge.stage, fit)}
     return model.model_copy(update={"parameters": {**model.parameters, **moved}})
 
 
 def checked_shape(shape: Sequence[str]) -> tuple[str, ...]:
     """What is known of curves; InputError where that is no shape, or no curve has it all."""
-    from vaneloop.identification.unmodelled.curve_candidates import SHAPES
-
     for name in shape:
         if name not in SHAPES:
             raise InputError(f"shape (={name!r}): allowed: {', '.join(SHAPES)}")
@@ -305,16 +283,6 @@ def checked_shape(shape: Sequence[str]) -> tuple[str, ...]:
 def _learned(
     diagnosed: Diagnosed, added: Model | None, progress: Callable[[float], None], shape: Sequence[str], formulas: bool
 ) -> Learned:
-    from vaneloop.identification.results import answer_of, found_of, rms_of
-    from vaneloop.identification.unmodelled.curve_candidates import UserModelCandidates, on_logs
-    from vaneloop.identification.unmodelled.learned_law import law_of
-    from vaneloop.identification.unmodelled.learned_surface import LearnedSurface, surface_law_of
-    from vaneloop.identification.unmodelled.learning import CurveSearch
-    from vaneloop.identification.unmodelled.parametric_substitution import spoken
-    from vaneloop.identification.unmodelled.surface_candidates import SurfaceCandidate
-    from vaneloop.identification.unmodelled.surface_closed_forms import as_the_law, reach_of
-    from vaneloop.identification.user_models.by_log import ByLog
-
     assert diagnosed.by_log is not None
     logs = diagnosed.by_log.logs
     ground = UserModelCandidates(logs)
@@ -356,12 +324,6 @@ def _beside_named(
     """Curves beside the laws of the library that `diagnose` names, where these leave more than noise, and curves alone
     do too; None where that is not better: a valve's flow is a curve, and its dead time is none.
     """
-    import numpy as np
-
-    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
-    from vaneloop.identification.selection.relative_error_acceptance import HARM, LEAST_FALL, UNKNOWN
-    from vaneloop.identification.user_models.by_log import ByLog, as_given, bind
-
     assert diagnosed.by_log is not None
     by, d = diagnosed.by_log, diagnosed.diagnosis.stages[0]
     left = alone.laws[-1].error_after if alone.laws else d.excess
@@ -411,9 +373,6 @@ def _as_model(model: Model, outcome: Outcome, laws: list[LearnedLaw], last: Fitt
 
     last  the model with all of them, as it was fitted
     """
-    from plant.model import Learned as Table
-    from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
-
     effects, curves = dict(model.effects), dict(model.curves)
     for law, tried in zip(laws, outcome.tried, strict=True):
         c = tried.candidate

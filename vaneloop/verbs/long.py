@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from hil.logs import LogError
 from vaneloop.base.side_by_side import forks, in_processes
 from vaneloop.identification.chunked_residuals import BLOCKS, Failing, Sums, failing, joined, of_whole, sums_of
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.regimes import Located
 from vaneloop.identification.results import StageDiagnosis, rms_of, weigh
 from vaneloop.identification.selection.subsampled_search import spread
-from vaneloop.identification.subsystem import Array
+from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.workflow import Diagnosis, News, locate_stages, verdict_of
 from vaneloop.identification.workflow import diagnose as search
 
@@ -27,9 +28,19 @@ if TYPE_CHECKING:
     from hil.logs import Log
     from vaneloop.identification.vane_chain.chain import Chain
     from vaneloop.identification.vane_chain.resample import Grid
-    from vaneloop.verbs.machine import Machine
 
-__all__ = ["LONG", "Held", "Whole", "changed", "excerpted", "held_against", "held_results", "located", "searched"]
+__all__ = [
+    "LONG",
+    "Held",
+    "Whole",
+    "carried",
+    "changed",
+    "excerpted",
+    "held_against",
+    "held_results",
+    "located",
+    "searched",
+]
 
 LONG = 360_000  # rows, an hour at 100 Hz; a log with more is fitted on an excerpt
 FITTED = 120_000  # rows of an excerpt, half of them evenly spaced: three times what a stage is searched on
@@ -95,9 +106,12 @@ class Whole:
         return self.chain(sorted({*self.chosen, *pieces}))
 
 
-def excerpted(log: Log, grid: Grid, machine: Machine, fitted: int = FITTED) -> Chain:
-    """The stages of an excerpt of a long log, of about so many rows (``fitted``)."""
-    whole = Whole(log, grid, partial(machine.stages_of, log, grid))
+def excerpted(log: Log, grid: Grid, stages_of: Callable[..., Chain], fitted: int = FITTED) -> Chain:
+    """The stages of an excerpt of a long log, of about so many rows (``fitted``).
+
+    stages_of  function from the log, its grid and pieces of rows to their stages (`Machine.stages_of`)
+    """
+    whole = Whole(log, grid, partial(stages_of, log, grid))
     return whole.chain(_everywhere(whole, spread(whole.pieces, max(2, fitted // whole.rows), ())))
 
 
@@ -254,9 +268,6 @@ def _times(whole: Whole, sums: Sums, hot: Array, ratio: Array) -> list[Failing]:
 
 def _stretch(work: Work, k: int) -> list[Sums]:
     """Sums of one stretch of the log at work."""
-    from hil.logs import LogError
-    from vaneloop.verbs.parts import carried
-
     whole, chain, fits = work
     rows, block = whole.rows, whole.rows // BLOCKS
     first, behind = k * STRETCH * rows, min((k + 1) * STRETCH * rows, whole.grid.rows)
@@ -276,6 +287,20 @@ def _stretch(work: Work, k: int) -> list[Sums]:
         out.append(sums_of(stage, stage.floor, moved, first // block, -(-behind // block), block))
     del here, stage
     gc.collect()  # a stage and its functions hold each other
+    return out
+
+
+def carried(here: Stage, theta: Array, there: Stage) -> Array:
+    """Parameters of one stage as another's of the same machine."""
+    out = there.neutral()
+    names = [p.name for p in here.parameters]
+    for i, p in enumerate(there.parameters):
+        if p.name in names:
+            out[i] = theta[names.index(p.name)]
+    mine = here.index()
+    for name, columns in there.index().items():
+        if name in mine:
+            out[columns] = theta[mine[name]]
     return out
 
 

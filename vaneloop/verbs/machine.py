@@ -8,13 +8,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from controller import load_calibration
+from hil.logs import LogError
+from hil.native import Program
+from plant import Model, build_plant, load_model
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import same_stages
 
 if TYPE_CHECKING:
     from controller import Calibration
     from hil.logs import Log
-    from plant import Model, Plant
+    from plant import Plant
     from vaneloop.identification.vane_chain.chain import Chain
     from vaneloop.identification.vane_chain.resample import Grid
 
@@ -74,8 +78,6 @@ class Machine:
     @cached_property
     def added(self) -> Model:
         """What the model file adds to the nominal machine."""
-        from plant import Model, load_model
-
         if self.model is None:
             return Model()
         return self.model if isinstance(self.model, Model) else load_model(self.model, self._built(None))
@@ -88,20 +90,14 @@ class Machine:
     @cached_property
     def calibration(self) -> Calibration:
         """What the controller is flashed with."""
-        from controller import load_calibration
-
         f = self.files
         made = load_calibration(f["calibration"], f["stroke_tables"], self.strategy, f["vane_angles"])
         if self.controller is None:
             return made
-        from hil.native import Program
-
         own = Path(self.tables or "") / OWN
         return made._replace(program=Program(str(self.controller), str(own) if self.tables and own.is_file() else None))
 
     def _built(self, model: Model | None) -> Plant:
-        from plant import build_plant
-
         return build_plant(self.files["plant"], self.files["geometry"], self.files["schedules"], model)
 
     def bind(self, log: Log) -> Chain:
@@ -114,11 +110,10 @@ class Machine:
         from vaneloop.verbs.long import LONG, excerpted
 
         grid = grid_of(log)
-        return excerpted(log, grid, self) if grid.rows > LONG else self.stages_of(log, grid)
+        return excerpted(log, grid, self.stages_of) if grid.rows > LONG else self.stages_of(log, grid)
 
     def stages_of(self, log: Log, grid: Grid, pieces: Sequence[tuple[int, int]] = (), **few: int) -> Chain:
         """`bind` of some rows of a log, as `build_chain` takes them; default: of all."""
-        from hil.logs import LogError
         from vaneloop.identification.vane_chain.chain import build_chain
 
         present = tuple(self.added.effects)
@@ -127,3 +122,19 @@ class Machine:
             why = "; ".join(f"{k}: {v}" for k, v in chain.not_observed.items())
             raise LogError(f"{log.path}: no stage can be judged ({why})")
         return chain
+
+
+def with_law_files(effects: Sequence[str], machine: Machine) -> tuple[list[str], Model]:
+    """Effects with those of law files (``X.toml``) by their names, and the machine's model with these laws."""
+    added, wanted = machine.added, []
+    for e in effects:
+        if not e.endswith(".toml"):
+            wanted.append(e)
+            continue
+        law = load_model(e, machine.plant)
+        if not law.curves:
+            raise InputError(f"--effect {e}: has no table curves; allowed: a law file of vaneloop learn")
+        wanted += list(law.curves)
+        own = {name: law.effects.get(name, {}) for name in law.curves}
+        added = added.model_copy(update={"curves": {**added.curves, **law.curves}, "effects": {**added.effects, **own}})
+    return wanted, added

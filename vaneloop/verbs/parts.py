@@ -10,17 +10,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hil.logs import read_log
+from hil.logs.held import held
 from vaneloop.base.errors import InputError
 from vaneloop.base.spans import Span, apart, is_span, spans_of
 from vaneloop.identification import Record, StageError, System
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
-from vaneloop.identification.subsystem import Array, Stage
+from vaneloop.identification.subsystem import Array
+from vaneloop.verbs.long import carried, held_against
 
 if TYPE_CHECKING:
     from hil.logs import Log
     from vaneloop.verbs.machine import Machine
 
-__all__ = ["Tested", "bind_parts", "carried", "part_of", "read_record", "records_of", "split", "tested"]
+__all__ = ["Tested", "bind_parts", "part_of", "read_record", "records_of", "split", "tested"]
 
 
 @dataclass(frozen=True)
@@ -97,8 +100,6 @@ def tested(chain: Any, fits: Sequence[tuple[str, Fit, Fit]]) -> list[Tested]:
         judge = LeastSquaresProblem(stage, stage.floor)
         thetas = np.array([carried(here, f.theta, stage) for f in (before, after)])
         if test.whole is not None:
-            from vaneloop.verbs.long import held_against
-
             sums = held_against(test, [(name, list(thetas), judge.floor, np.inf)]).sums[name]
             n, rms = sums.samples.sum(axis=1), sums.rms() * judge.floor
         else:
@@ -107,20 +108,6 @@ def tested(chain: Any, fits: Sequence[tuple[str, Fit, Fit]]) -> list[Tested]:
         for k, signal in enumerate(stage.outputs):
             figures = float(rms[0, k]), float(rms[1, k]), float(judge.floor[k]), int(n[k])
             out.append(Tested(name, signal, stage.units[k], *figures))
-    return out
-
-
-def carried(here: Stage, theta: Array, there: Stage) -> Array:
-    """Parameters of one stage as another's of the same machine."""
-    out = there.neutral()
-    names = [p.name for p in here.parameters]
-    for i, p in enumerate(there.parameters):
-        if p.name in names:
-            out[i] = theta[names.index(p.name)]
-    mine = here.index()
-    for name, columns in there.index().items():
-        if name in mine:
-            out[columns] = theta[mine[name]]
     return out
 
 
@@ -146,9 +133,6 @@ def read_record(path: str | Path, system: System, **reading: Any) -> tuple[Recor
     name = Path(path).name
     if system.read is not None:
         return Record(name, *_by_its_own_reader(str(path), system)), []
-    from hil.logs import read_log
-    from hil.logs.held import held
-
     motion = {c: system.units.get("position", "") for c in (system.position,) if c} | {
         c: "" for c in (system.velocity,) if c
     }

@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hil.logs import read_log
 from hil.replay import ReplayResult, replay_json
 from hil.replay import replay as run
+from vaneloop.pages.replay import replay_page
 from vaneloop.verbs.answer import Answer
 from vaneloop.verbs.machine import Machine, files_of
 
@@ -53,15 +55,11 @@ class Replay(Answer):
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
-        from vaneloop.pages.replay import replay_page
-
         return replay_page(self.result, command)
 
 
 def log_of(log: Log | str | Path, machine: Machine, require: tuple[str, ...] = ("n_dem",)) -> Log:
     """The log, read where it is a file's name: what is guessed is held against the machine's own tables."""
-    from hil.logs import read_log
-
     if not isinstance(log, str | Path):
         return log
     return read_log(log, require=require, tables=files_of(machine.tables))

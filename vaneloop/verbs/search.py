@@ -5,6 +5,7 @@ A model is the vane machine (`Machine`), held against one log, or a user's own (
 
 from __future__ import annotations
 
+import difflib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -12,9 +13,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from plant import write_model
+from plant.curve import PLACES
+from plant.effects import EFFECTS
 from vaneloop.base.errors import InputError
 from vaneloop.identification import Record, StageError, System
 from vaneloop.identification.regimes import Located
+from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance
+from vaneloop.identification.user_models.by_log import ByLog, as_given, bind
+from vaneloop.identification.vane_chain.candidates import SCALE, curve_effect, with_laws, without_laws
+from vaneloop.identification.vane_chain.experiment import recommend
 from vaneloop.identification.workflow import (
     Diagnosis,
     News,
@@ -25,10 +33,19 @@ from vaneloop.identification.workflow import (
     no_better,
 )
 from vaneloop.identification.workflow import diagnose as search
+from vaneloop.pages.diagnosis import (
+    compare_page,
+    diagnosis_page,
+    experiment_page,
+    extended_page,
+    located_sentence,
+    verdict_sentence,
+)
+from vaneloop.pages.story import extended_sentence, reached
 from vaneloop.verbs.answer import Answer
 from vaneloop.verbs.long import Held, changed, held_results, searched
 from vaneloop.verbs.long import located as located_of
-from vaneloop.verbs.machine import Machine
+from vaneloop.verbs.machine import Machine, with_law_files
 from vaneloop.verbs.parts import Tested, bind_parts, read_record, records_of, split, tested
 from vaneloop.verbs.replay import log_of
 
@@ -37,7 +54,7 @@ if TYPE_CHECKING:
     from plant import Model
     from vaneloop.identification.results import StageDiagnosis
     from vaneloop.identification.subsystem import Bound
-    from vaneloop.identification.user_models.by_log import ByLog, Logs
+    from vaneloop.identification.user_models.by_log import Logs
     from vaneloop.identification.vane_chain.chain import Chain
     from vaneloop.pages.page import Page
 
@@ -78,8 +95,6 @@ class Stages(Answer):
 
     def sentence(self) -> str:
         """The answer in one sentence."""
-        from vaneloop.pages.diagnosis import located_sentence
-
         return located_sentence(self.located, self.bound.not_observed, self.held.failing if self.held else ())
 
     def to_dict(self) -> dict[str, Any]:
@@ -94,8 +109,6 @@ class Stages(Answer):
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
-        from vaneloop.pages.diagnosis import compare_page
-
         title = "Where the model fails" if self.verb == "locate" else "Model and log"
         return compare_page(self.located, self.bound, command, self.log, self.by_log, self.tested, title)
 
@@ -132,8 +145,6 @@ class Diagnosed(Answer):
 
     def sentence(self) -> str:
         """The answer in one sentence."""
-        from vaneloop.pages.diagnosis import verdict_sentence
-
         return verdict_sentence(self.diagnosis, self.by_log)
 
     def to_dict(self) -> dict[str, Any]:
@@ -144,8 +155,6 @@ class Diagnosed(Answer):
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
-        from vaneloop.pages.diagnosis import diagnosis_page
-
         return diagnosis_page(self.diagnosis, self.bound, command, self.log, by_log=self.by_log, tested=self.tested)
 
 
@@ -165,20 +174,14 @@ class Extended(Diagnosed):
     @property
     def reached(self) -> bool:
         """Whether each stage extended stands at its noise floor."""
-        from vaneloop.pages.story import reached
-
         return all(map(reached, self.diagnosis.stages))
 
     def sentence(self) -> str:
         """The answer in one sentence."""
-        from vaneloop.pages.story import extended_sentence
-
         return extended_sentence(self.diagnosis, self.refused)
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
-        from vaneloop.pages.diagnosis import extended_page
-
         return extended_page(self.diagnosis, self.bound, command, self.log, self.refused, self.by_log, self.tested)
 
     def to_dict(self) -> dict[str, Any]:
@@ -188,8 +191,6 @@ class Extended(Diagnosed):
 
     def write(self, path: str | Path) -> Path:
         """Write the model file that every command takes with ``--model``; return its path."""
-        from plant import write_model
-
         assert self.model is not None
         write_model(str(path), self.model)
         return Path(path)
@@ -217,8 +218,6 @@ class Experiment(Answer):
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
-        from vaneloop.pages.diagnosis import experiment_page
-
         d = self.diagnosed
         return experiment_page(d.diagnosis, d.bound, command, self.log, self.sentence(), self.recommended)
 
@@ -246,8 +245,6 @@ def _records(logs: Any, system: System) -> list[Record]:
 
 def _logs(log: Any, system: System, fit: Any, test: Any, added: Model | None) -> tuple[Logs, str]:
     """The records held against a system, and the first one's name."""
-    from vaneloop.identification.user_models.by_log import bind
-
     to_fit, to_test, others = split(fit, test)
     try:
         first, *more = _records(log, system)
@@ -276,8 +273,6 @@ def compare(
     added  parameters and laws that a `System` has by now; a `Machine` has its own
     """
     if isinstance(model, System):
-        from vaneloop.identification.user_models.by_log import ByLog, as_given
-
         logs, name = _logs(log, model, fit, test, added)
         located = locate_stages(logs.fitted.stages)
         return Stages(logs.fitted, located, name, ByLog.of(logs, as_given(logs, located[0].fit), added))
@@ -321,8 +316,6 @@ def diagnose(
     workers  stages searched at a time
     """
     if isinstance(model, System):
-        from vaneloop.identification.user_models.by_log import ByLog
-
         model = replace(model, without=(*model.without, *without))
         logs, name = _logs(log, model, fit, test, added)
         d = search(logs.fitted.stages, None, progress, 1, logs.judged())
@@ -337,8 +330,6 @@ def not_given(chain: Chain, effects: Sequence[str]) -> Chain:
     """The chain, of whose stages some effects are not looked for."""
     if not effects:
         return chain
-    from vaneloop.identification.vane_chain.candidates import without_laws
-
     known(effects, "without")
     return changed(chain, lambda c: replace(c, stages=without_laws(c.stages, effects)))
 
@@ -384,8 +375,6 @@ def extend(
     if isinstance(model, System):
         return _extended(*_logs(log, model, fit, test, added), effects, added)
     machine = model or Machine()
-    from vaneloop.verbs.learn import with_law_files
-
     wanted, more = with_law_files(effects, machine)
     known([e for e in wanted if e not in more.curves])
     chain, name = chain_for(log, Machine(machine.tables, None, machine.strategy, machine.table), fit, test)
@@ -394,9 +383,6 @@ def extend(
 
 def _extended(logs: Logs, name: str, effects: Sequence[str], added: Model | None) -> Extended:
     """`extend` of a system that has been held against its logs."""
-    from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance
-    from vaneloop.identification.user_models.by_log import ByLog
-
     started = time.perf_counter()
     bound = logs.fitted
     have = [e.name for e in bound.stage.effects]
@@ -411,18 +397,12 @@ def _extended(logs: Logs, name: str, effects: Sequence[str], added: Model | None
 
 
 def _close(name: str, known: Sequence[str]) -> str:
-    import difflib
-
     close = difflib.get_close_matches(name, known, 3, 0.4)
     return f"close: {', '.join(close)}" if close else f"it can have {', '.join(known)}"
 
 
 def known(effects: Sequence[str], option: str = "effect") -> None:
     """Refuse an effect that is not in the library; ``option``: by which it was given."""
-    import difflib
-
-    from plant.effects import EFFECTS
-
     for name in effects:
         if name not in EFFECTS:
             close = difflib.get_close_matches(name, EFFECTS, 1)
@@ -432,10 +412,6 @@ def known(effects: Sequence[str], option: str = "effect") -> None:
 
 def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Extended:
     """`extend` of a log that has been put into the stages of the nominal machine; ``before``: the model so far."""
-    from plant.curve import PLACES
-    from plant.effects import EFFECTS
-    from vaneloop.identification.vane_chain.candidates import curve_effect, with_laws
-
     started = time.perf_counter()
     by_stage: dict[str, list[str]] = {}
     curves: dict[str, list[Any]] = {}
@@ -487,9 +463,6 @@ def with_fits(model: Model, results: Sequence[StageDiagnosis]) -> Model:
     """The model with effects and nominal parameters as stages of the vane chain were fitted; a curve of a law file is
     as it was learned, times its scale.
     """
-    from plant.effects import EFFECTS
-    from vaneloop.identification.vane_chain.candidates import SCALE
-
     parameters, effects = dict(model.parameters), dict(model.effects)
     for r in results:
         parameters |= {str(q["parameter"]): float(cast(float, q["value"])) for q in r.recalibrated}
@@ -509,8 +482,6 @@ def experiment(log: Any, model: Machine | Diagnosed | None = None, *, progress: 
 
     model  the machine, or the diagnosis of this log where that has been made
     """
-    from vaneloop.identification.vane_chain.experiment import recommend
-
     if not isinstance(model, Diagnosed):
         chain, name = chain_for(log, model or Machine())
         model = diagnosed(chain, name)

@@ -7,8 +7,10 @@ import os
 import secrets
 import socket
 import sys
+import webbrowser
 from pathlib import Path
 
+from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
 from vaneloop.cli.options import add_controller_options, add_tables_option, machine_of
 from vaneloop.web.guard import is_loopback
@@ -60,8 +62,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    from vaneloop.base.errors import InputError
-
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port (={args.port}) must be in [0, 65535]")
     if not 1 <= args.upload_limit <= 16384:
@@ -89,8 +89,6 @@ def command(args: argparse.Namespace) -> int:
         if not args.quiet:
             print("Ctrl-C ends it", file=sys.stderr, flush=True)
         if not args.no_open:
-            import webbrowser
-
             webbrowser.open(address + once)  # every user may read a browser's command line
 
     from vaneloop.web.server import serve
@@ -100,8 +98,6 @@ def command(args: argparse.Namespace) -> int:
 
 
 def _listen(host: str, port: int) -> socket.socket:
-    from vaneloop.base.errors import InputError
-
     try:
         family, kind, proto, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         sock = socket.socket(family, kind, proto)

@@ -16,8 +16,9 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from vaneloop.base.child import python_module
+from vaneloop.base.vanes import VANES
 
-__all__ = ["Cancelled", "Job", "Spare", "WorkError", "Worker"]
+__all__ = ["COLUMNS", "COMPILING", "STEPS", "Cancelled", "Job", "Spare", "WorkError", "Worker"]
 
 
 # A search has its own two processes: threads of linear algebra would only wait for each other (10 % of a search).
@@ -54,6 +55,10 @@ class Job:
 
 
 LOADING = 0  # in place of a question's number: said before any is answered
+COMPILING = "loading the simulator (compiling it the first time takes about 20 s)"
+STEPS = ("mechanism", "stroke", "links", "loop", "tables")  # of the schedule page
+# of every machine; a stage that one lacks is NaN
+COLUMNS = ("t", "n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", *VANES, "p_s", "t_oil", "state", "faults")
 Started = tuple[subprocess.Popen[bytes], Connection]
 
 

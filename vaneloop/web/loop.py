@@ -11,23 +11,37 @@ from __future__ import annotations
 import os
 import random
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hil.bus import frames
+from hil.bus.lockstep_bus import Channel
+from hil.bus.port import Port, open_bus
+from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
+from hil.calibrate.master import Master
+from hil.calibrate.station import MASTER, SLAVE, data_of, row_of
+from hil.inject import actions, injection
+from hil.inject.injection import run
+from hil.inject.scenario import load_scenario
+from hil.inject.tamper import Gateway, Intruder
+from hil.logs.recorder import Recorder, RecorderProcess
+from hil.loop.ecu import EcuStation, Typed, builtin
+from hil.loop.node import Ecu, Node
+from hil.loop.realtime import Stop, packed, run_realtime, undisturbed
+from hil.native import black_box
 from vaneloop.base import terminal
-from vaneloop.base.vanes import VANES
+from vaneloop.cli.attended import accepted, attend
 from vaneloop.verbs.machine import Machine
-from vaneloop.web.worker import INBOX, Progress, main, parsed
+from vaneloop.web.jobs import COLUMNS, COMPILING
+from vaneloop.web.process import INBOX, Progress, answer, parsed
 
-__all__ = ["COLUMNS", "COMPILING", "TASKS"]
+__all__ = ["TASKS"]
 
-# of every machine; a stage that one lacks is NaN
-COLUMNS = ("t", "n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", *VANES, "p_s", "t_oil", "state", "faults")
 MOST_TRACE = 120  # frames of the trace sent at a time; the rest are counted only
-COMPILING = "loading the simulator (compiling it the first time takes about 20 s)"
 NEWS = 0.1  # s between two messages to the page
 
 
@@ -42,15 +56,15 @@ class Heard:
 
     def hear(self, t: float, head: int, data: int) -> None:
         """Take one frame."""
-        from hil.bus import frames as f
-
         self.frames += 1
-        ident = head & f.IDENT_MASK
+        ident = head & frames.IDENT_MASK
         ours = (
-            ident in f.NAMES and not head & (f.ERROR | f.EXTENDED | f.REMOTE | f.FD) and (head >> 32) & 0xFF == f.LENGTH
+            ident in frames.NAMES
+            and not head & (frames.ERROR | frames.EXTENDED | frames.REMOTE | frames.FD)
+            and (head >> 32) & 0xFF == frames.LENGTH
         )
-        good = ours and f.crc(ident, data) == (data & 0xFF)
-        values = f.decode(head, data) if ours else {}
+        good = ours and frames.crc(ident, data) == (data & 0xFF)
+        values = frames.decode(head, data) if ours else {}
         if ours and not good:
             self.refused += 1
         if len(self.trace) < MOST_TRACE:
@@ -60,9 +74,9 @@ class Heard:
         for name, v in values.items():
             if name in self.now:
                 self.now[name] = v
-        if ident == f.VGV_SERVO:
-            self.now["faults"] = float(f.decode_servo(data)[1])
-        if ident == f.VGV_ANGLES:
+        if ident == frames.VGV_SERVO:
+            self.now["faults"] = float(frames.decode_servo(data)[1])
+        if ident == frames.VGV_ANGLES:
             self.now["t"] = t
             self.rows.append([self.now[c] for c in COLUMNS])
 
@@ -82,9 +96,6 @@ class Tool:
     """The calibration tool on the bus: what the page asks for goes through an XCP master to the controller's slave."""
 
     def __init__(self) -> None:
-        from hil.calibrate.master import Master
-        from hil.calibrate.station import MASTER, SLAVE, data_of, row_of
-
         self._master, self._idents, self._row, self._data = Master(), (MASTER, SLAVE), row_of, data_of
 
     def ask(self, jobs: list[tuple[int, list[bytes]]]) -> None:
@@ -113,8 +124,6 @@ def _attended(progress: Progress, node: Any, tuned: str | None, bus: str = "") -
 
     bus  it runs on in real time; "": in simulated time
     """
-    from vaneloop.cli.attended import attend
-
     args = parsed("run", ["--xcp", "--xcp-open", "--xcp-save", str(tuned)])
     attended = attend(args, node, recorded=not bus)
     attended.told = bool(bus)
@@ -150,10 +159,6 @@ class _Injected:
 
     def add(self, name: str, k: int) -> None:
         """Begin the shipped scenario ``name`` now: its first action starts at tick ``k``."""
-        from hil.inject import injection
-        from hil.inject.actions import Machine, OnBus, OnFrame, Outsider
-        from hil.inject.scenario import load_scenario
-        from hil.inject.tamper import Gateway, Intruder
 
         scenario = load_scenario(name)
         first = min((a.start for a in scenario.inject), default=0.0)
@@ -161,15 +166,15 @@ class _Injected:
         moved = [a.model_copy(update={"start": k * 1e-3 + a.start - first}) for a in scenario.inject]
         chance = random.Random(scenario.seed)
         for who in self.gateways:
-            mine = [a for a in moved if isinstance(a, OnFrame) and injection.sender_of(a) == who]
+            mine = [a for a in moved if isinstance(a, actions.OnFrame) and injection.sender_of(a) == who]
             if mine:
                 self.gateways[who].append(Gateway(mine, chance))
         for a in moved:
-            if isinstance(a, Outsider):
+            if isinstance(a, actions.Outsider):
                 self.intruders.append((self.channel.join(), Intruder(a, chance, self.recorded)))
-            elif isinstance(a, Machine):
+            elif isinstance(a, actions.Machine):
                 self.machines.append(injection.MachineChange(a, self.node, self.ecu))
-        on_bus = [a for a in moved if isinstance(a, OnBus)]
+        on_bus = [a for a in moved if isinstance(a, actions.OnBus)]
         if on_bus:
             self.disturbers.append(injection.Disturber(on_bus, self.channel.wire, self.places))
         self.end = max(self.end, *(min(a.end, k * 1e-3 + scenario.duration - first) for a in moved), 0.0)
@@ -191,10 +196,6 @@ class _Injected:
 
 
 def _compile() -> None:
-    from hil.bus.lockstep_bus import Channel
-    from hil.bus.wire import BITS_PER_TICK, put, run_wire, take
-    from hil.loop.node import Ecu, Node
-
     rows = np.zeros((1, 2), np.int64)
     channel = Channel(seed=0)
     place = channel.join()
@@ -208,8 +209,6 @@ def _compile() -> None:
 def _machine(tables: str | None, controller: str | None, boxes: str | None) -> Machine:
     """The machine of a run; a controller of the user's own leaves its black boxes in ``boxes``."""
     if boxes is not None:
-        from hil.native import black_box
-
         black_box.watched(Path(boxes), False)
     return Machine(tables, controller=controller)
 
@@ -238,13 +237,6 @@ def lockstep(
     controller, boxes  shared library of the user's own, and the folder of its black boxes; None: the firmware here
     tuned  folder into which a calibration tool saves
     """
-    from hil.bus.lockstep_bus import Channel
-    from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
-    from hil.logs.recorder import Recorder
-    from hil.loop.ecu import EcuStation, Typed, builtin
-    from hil.loop.node import Ecu, Node
-    from hil.loop.realtime import packed
-
     typed = Typed(demand)
     progress(None, COMPILING)
     _compile()
@@ -347,8 +339,6 @@ def node(
     tuned: str | None = None,
 ) -> dict[str, Any]:
     """Controller and plant in real time, as ``vaneloop run`` does: lateness as it goes, until told to stop."""
-    from hil.loop.node import Node
-
     progress(None, COMPILING)
     machine = _machine(tables, controller, boxes)
     made = Node(machine.plant, machine.calibration, seed=seed)
@@ -357,9 +347,6 @@ def node(
 
 def ecu(progress: Progress, bus: str, demand: float, profile: str | None, tables: str | None = None) -> dict[str, Any]:
     """The ECU in real time, as ``vaneloop ecu`` does: the demand is told, until told to stop."""
-    from hil.loop.ecu import EcuStation, Typed
-    from hil.loop.node import Ecu
-
     typed = Typed(demand)
     return _in_real_time(
         progress, bus, EcuStation(typed, ecu=Ecu(Machine(tables).plant, n_dem=demand)), None, (typed, profile)
@@ -367,14 +354,6 @@ def ecu(progress: Progress, bus: str, demand: float, profile: str | None, tables
 
 
 def _in_real_time(progress: Progress, name: str, station: Any, record: str | None, typed: Any) -> dict[str, Any]:
-    import threading
-
-    from hil.bus.port import Port, open_bus
-    from hil.logs.recorder import RecorderProcess
-    from hil.loop.ecu import builtin
-    from hil.loop.realtime import Stop, run_realtime, undisturbed
-    from vaneloop.cli.attended import accepted
-
     stop = Stop()
     station.tick(np.zeros((1, 2), np.int64), 0)  # compiled before the first deadline
 
@@ -423,8 +402,6 @@ def _in_real_time(progress: Progress, name: str, station: Any, record: str | Non
 
 def listen(progress: Progress, bus: str) -> dict[str, Any]:
     """Hear everything on a bus, and be the calibration tool on it, until told to stop."""
-    from hil.bus.port import Port, open_bus
-
     opened = open_bus(bus)
     port, heard, tool = Port(opened), Heard(), Tool()
     rows = np.zeros((512, 2), np.int64)
@@ -455,9 +432,6 @@ def outside(progress: Progress, scenario: str, bus: str) -> bool:
 
     Says when its first action began: ``at`` on this machine's clock, which the listener's ``clock`` counts from.
     """
-    from hil.inject.injection import run
-    from hil.inject.scenario import load_scenario
-
     made = load_scenario(scenario)
     first = min((a.start for a in made.inject), default=0.0)
     told = False
@@ -477,4 +451,4 @@ TASKS = {f.__name__: f for f in (ready, lockstep, node, ecu, listen, outside)}
 if __name__ == "__main__":
     if "--nice" in sys.argv:
         os.nice(5)
-    sys.exit(terminal.run(lambda: main(int(sys.argv[1]), TASKS)))
+    sys.exit(terminal.run(lambda: answer(int(sys.argv[1]), TASKS)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections import deque
 from collections.abc import Coroutine
@@ -13,11 +14,11 @@ import numpy as np
 
 from controller import FAULTS, MODES
 from hil.inject.scenario import load_scenario
+from hil.native import black_box, isolation
 from vaneloop.base.vanes import VANES
 from vaneloop.pages.style import STAGE_ROLES
 from vaneloop.web.charts import Curves, Mark, Panel, Trace, mode_bands
-from vaneloop.web.jobs import Cancelled, Worker, WorkError
-from vaneloop.web.loop import COLUMNS, COMPILING
+from vaneloop.web.jobs import COLUMNS, COMPILING, Cancelled, Worker, WorkError
 from vaneloop.web.moments import Moment, bit_bands, told
 from vaneloop.web.session import LogFile, Session
 from vaneloop.web.tuning import Tuning
@@ -115,11 +116,6 @@ class Loop:
 
     async def _watched(self, worker: Worker, call: Coroutine[Any, Any, Any]) -> Any:
         """Wait for a run; end its process where a controller of the user's own hangs, and say how it failed."""
-        import asyncio
-
-        from hil.native import black_box
-        from hil.native.isolation import PATIENCE, told
-
         task = asyncio.ensure_future(call)
         task.add_done_callback(lambda t: t.cancelled() or t.exception())  # the page may be gone: nobody asks for it
         seen = b""
@@ -128,7 +124,7 @@ class Loop:
             now = black_box.progress(self.boxes) if self.boxes is not None else b""
             if now != seen or not now:
                 seen, since = now, time.monotonic()
-            elif time.monotonic() - since > PATIENCE:
+            elif time.monotonic() - since > isolation.PATIENCE:
                 hung = True
                 worker.stop()
         try:
@@ -138,7 +134,9 @@ class Loop:
             if box is None:
                 raise
             raise WorkError(
-                told(box, f"did not come back within {PATIENCE:g} s" if hung else "ended its process")
+                isolation.told(
+                    box, f"did not come back within {isolation.PATIENCE:g} s" if hung else "ended its process"
+                )
             ) from None
 
     # ---- begin and end
@@ -199,8 +197,6 @@ class Loop:
             self._ended(record)
 
     async def _in_real_time(self) -> None:
-        import asyncio
-
         record = self._record_path()
         bus = self.bus_name
         listener, controller, engine = (self._worker(n) for n in ("listen", "node", "ecu"))

@@ -25,8 +25,8 @@ from vaneloop.pages.style import STAGE_ROLES
 from vaneloop.verbs.machine import files_of
 from vaneloop.web.chosen_log import receive, suffixes
 from vaneloop.web.frame import Live, card, command_line, dark, drop, figure_of, frame, opened, table
+from vaneloop.web.jobs import STEPS
 from vaneloop.web.session import LogFile, Session
-from vaneloop.web.worker import STEPS
 
 __all__ = ["build"]
 

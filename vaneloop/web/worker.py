@@ -1,70 +1,68 @@
 """A process beside the server that does the long work: reads logs, searches, refits. ``python -m vaneloop.web.worker
 FD`` speaks over a socket.
 
-It calls what the command line calls. Its own process group holds whatever it starts, so that ending the group ends
-everything; when the server is gone it ends itself. Answers come one by one, in the order of the questions.
+It calls what the command line calls.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import os
-import queue
-import resource
-import signal
 import sys
-import threading
-import time
 from collections.abc import Callable
-from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
+import numpy as np
+
+from controller import FAULTS
+from hil.logs import Channel, Log, columns, offered, read_log
 from hil.logs.formats import is_framed
+from hil.logs.survey import survey
+from hil.logs.table import NoTime
+from hil.loop.lockstep import Stimulus, lockstep, warm_up
+from hil.replay import replay
+from plant import load_geometry, load_schedules
+from plant.geometry import vane_angles
+from plant.spatial import plane_joints
+from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
+from vaneloop.base.signals import UNITS
 from vaneloop.cli import options
-from vaneloop.web.jobs import LOADING
+from vaneloop.cli.chains import chain_of, tell_search
+from vaneloop.cli.main import main
+from vaneloop.cli.schedule import log_of
+from vaneloop.design.links import ScheduleOptions
+from vaneloop.design.schedule_files import write_tables
+from vaneloop.design.scheduling import schedule
+from vaneloop.design.stroke_tables import STROKE_LIMITS, stroke_tables, table_speeds
+from vaneloop.fleet.folder import Folder
+from vaneloop.fleet.report import view_of
+from vaneloop.fleet.state import state_of
+from vaneloop.fleet.tables import answers, roll_up
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.vane_chain.experiment import recommend
+from vaneloop.identification.workflow import extend_stage, locate_stages
+from vaneloop.pages.diagnosis import diagnosis_page, located_sentence, located_tone
+from vaneloop.pages.fleet import fleet_page, log_page
+from vaneloop.pages.schedule import NAMES, schedule_page
+from vaneloop.pages.story import fall, word
+from vaneloop.verbs.learn import learned, with_path
+from vaneloop.verbs.machine import Machine
+from vaneloop.verbs.search import Diagnosed, diagnosed
+from vaneloop.web.process import Progress, answer, parsed
 
-__all__ = ["STEPS", "TASKS"]
-
-Progress = Callable[[float | None, Any], None]
-MOST_MEMORY = 0.75  # of the machine's
-LEAST_MEMORY = 4 << 30  # bytes; compiled code reserves address space of its own
-
+__all__ = ["TASKS"]
 
 # ---- what is kept between questions ----------------------------------------------------------------------------------
 
 _CHAIN: dict[tuple[str, ...], Any] = {}  # of the latest log only
 
 
-def parsed(verb: str, words: list[str]) -> argparse.Namespace:
-    """Return the options of ``vaneloop VERB words`` as the command line parses them; InputError with its complaint."""
-    import importlib
-
-    from vaneloop.base import terminal
-    from vaneloop.base.errors import InputError
-    from vaneloop.cli.main import COMMANDS
-
-    module = importlib.import_module(COMMANDS[verb][0])
-    parser = terminal.Parser(prog=f"vaneloop {verb}", description=module.DESCRIPTION)
-    module.add_options(parser)
-    complaint = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(complaint):
-            args = parser.parse_args(words)
-    except SystemExit:
-        raise InputError(complaint.getvalue().strip().splitlines()[-1]) from None
-    args.quiet = True
-    return args
-
-
 def chain_for(words: list[str], progress: Progress) -> Any:
     """Return the log that ``words`` name (with its options), as stages; read once."""
-    from hil.loop.lockstep import warm_up
-    from vaneloop.cli.options import chain_of, tell_search
-
     key = tuple(words)
     if key not in _CHAIN:
         warm_up(lambda text: progress(None, text))
@@ -83,37 +81,20 @@ SECONDS = 20  # of the run that is compared to load what a comparison needs
 
 def ready(progress: Progress) -> None:
     """Load what a log will need, before there is one: modules, and compiled code by a comparison of a short run."""
-    import numpy as np
-    import pyarrow.parquet  # noqa: F401
-
-    import hil.logs.survey  # noqa: F401
-    import vaneloop.pages.diagnosis
-    import vaneloop.verbs.search  # noqa: F401
-    from hil.logs import Channel, Log
-    from hil.loop.lockstep import Stimulus, lockstep, warm_up
-    from vaneloop.base.signals import UNITS
-    from vaneloop.identification.workflow import locate_stages
-    from vaneloop.verbs.machine import Machine
-
     warm_up(lambda text: progress(None, text))
     run = lockstep(Stimulus.of(np.repeat([60.0, 90.0, 70.0, 95.0], 25 * SECONDS)), seed=1)
     log = Log("ready", {k: Channel(run.t, v) for k, v in run.columns.items() if k in UNITS})
-    options.tell_search(lambda text: progress(None, text))
+    tell_search(lambda text: progress(None, text))
     locate_stages(Machine().bind(log).stages)
 
 
 def offers(progress: Progress, path: str, dbc: str | None) -> list[str]:
     """Names that the log offers, to be mapped."""
-    from hil.logs import offered
-
     return offered(path, dbc=dbc)
 
 
 def look(progress: Progress, words: list[str]) -> dict[str, Any]:
     """What the form of names and units shows: the survey of the log, or why there is none."""
-    from hil.logs.survey import survey
-    from hil.logs.table import NoTime
-
     args = parsed("diagnose", words)
     try:
         seen = survey(args.log, **options.log_options(args))
@@ -129,14 +110,8 @@ def look(progress: Progress, words: list[str]) -> dict[str, Any]:
 
 def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
     """Read the log: its channels in our names and units; and the controller's faults, where it has them."""
-    from controller import FAULTS
-    from hil.logs import read_log
-    from hil.logs.columns import warm_up
-    from vaneloop.base.errors import InputError
-    from vaneloop.base.signals import UNITS
-
     if is_framed(Path(words[0])):
-        warm_up(lambda text: progress(None, text))
+        columns.warm_up(lambda text: progress(None, text))
     args = parsed("diagnose", words)
     named = {f"fault_{f}": f for f in FAULTS}  # as vgv.dbc calls them
     signals = {**UNITS, **dict.fromkeys(named, "-")}
@@ -151,10 +126,6 @@ def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
 
 def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
     """Compare and locate: errors stage by stage, failure maps, curves."""
-    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
-    from vaneloop.identification.workflow import locate_stages
-    from vaneloop.pages.diagnosis import located_sentence, located_tone
-
     chain = chain_for(words, progress)
     progress(0.1, "comparing")
     located = locate_stages(chain.stages, lambda share, name: progress(0.1 + 0.9 * share, f"locating: {name}"))
@@ -175,9 +146,6 @@ def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
 
 def whole_loop(progress: Progress, words: list[str], floors: dict[str, float]) -> tuple[list[Any], str]:
     """The whole loop's errors, and why there are none."""
-    from hil.replay import replay
-    from vaneloop.base.errors import InputError
-
     args = parsed("diagnose", words)
     try:
         machine = options.machine_of(args)
@@ -191,8 +159,6 @@ def curves_of(judge: Any, models: dict[str, Any]) -> dict[str, Any]:
     """Measured outputs of a stage and each model's error (in the output's unit), for plots. NaN where nothing
     counts.
     """
-    import numpy as np
-
     stage = judge.stage
     e = judge.errors(np.array(list(models.values()))) * judge.floor[None, :, None]
     out = {}
@@ -209,9 +175,6 @@ def curves_of(judge: Any, models: dict[str, Any]) -> dict[str, Any]:
 
 def diagnose(progress: Progress, words: list[str]) -> dict[str, Any]:
     """Search every stage for missing effects, as ``vaneloop diagnose`` does."""
-    from vaneloop.pages.story import fall, word
-    from vaneloop.verbs.search import diagnosed
-
     chain = chain_for(words, progress)
     progress(0.0, "searching the library of effects")
 
@@ -229,9 +192,6 @@ def diagnose(progress: Progress, words: list[str]) -> dict[str, Any]:
 
 def refit(progress: Progress, words: list[str], stage: str, effects: tuple[str, ...]) -> dict[str, Any]:
     """Fit one stage with exactly these effects, as ``vaneloop extend`` does."""
-    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
-    from vaneloop.identification.workflow import extend_stage
-
     chain = chain_for(words, progress)
     s = chain.stage(stage)
     expected = max(2.0, 1.5 * len(effects) * (len(effects) + 1))
@@ -257,10 +217,6 @@ def hand(
     """Error with parameters set by hand: nothing is fitted. ``values``: effect -> parameter -> value in its declared
     unit.
     """
-    import numpy as np
-
-    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
-
     chain = chain_for(words, progress)
     s = chain.stage(stage)
     judge = LeastSquaresProblem(s, np.asarray(floor))
@@ -277,8 +233,6 @@ def hand(
 
 def experiment(progress: Progress, words: list[str], diagnosis: Any) -> dict[str, Any] | None:
     """Recommend the next experiment, as ``vaneloop experiment`` does."""
-    from vaneloop.identification.vane_chain.experiment import recommend
-
     chain = chain_for(words, progress)
     return recommend(diagnosis, lambda f: progress(f, "trying demand profiles"), chain)
 
@@ -287,8 +241,6 @@ def report(
     progress: Progress, words: list[str], diagnosis: Any, path: str, command: str, next_experiment: Any = None
 ) -> str:
     """Write the page of the diagnosis, as ``vaneloop diagnose --report`` does."""
-    from vaneloop.pages.diagnosis import diagnosis_page
-
     chain = chain_for(words, progress)
     progress(None, "writing the page")
     return str(diagnosis_page(diagnosis, chain, command, words[0], next_experiment).write(path))
@@ -296,9 +248,6 @@ def report(
 
 def learn(progress: Progress, words: list[str], diagnosis: Any, law: str, page: str, command: str) -> dict[str, Any]:
     """Learn a law from a log that has been diagnosed, as ``vaneloop learn`` does; write its file and its page."""
-    from vaneloop.verbs.learn import learned, with_path
-    from vaneloop.verbs.search import Diagnosed
-
     chain = chain_for(words, progress)
     found = Diagnosed(chain, diagnosis, words[0])
     before = options.machine_of(parsed("diagnose", words)).added
@@ -317,10 +266,6 @@ def command(progress: Progress, words: list[str]) -> dict[str, Any]:
     """Run a whole command line of ours; return its exit code and what it said. InputError for bad input and for a
     defect of ours.
     """
-    from vaneloop.base import terminal
-    from vaneloop.base.errors import InputError
-    from vaneloop.cli.main import main
-
     said, complained = io.StringIO(), io.StringIO()
     sys.argv = ["vaneloop", *words]
     progress(None, "vaneloop " + words[0])
@@ -337,9 +282,6 @@ def command(progress: Progress, words: list[str]) -> dict[str, Any]:
 
 def engine_part(progress: Progress, path: str) -> tuple[str, Any]:
     """Read geometry or schedules: which of them the file is, and its content."""
-    from plant import load_geometry, load_schedules
-    from vaneloop.base.errors import InputError
-
     try:
         return "geometry", load_geometry(path)
     except InputError as no_geometry:
@@ -350,23 +292,8 @@ def engine_part(progress: Progress, path: str) -> tuple[str, Any]:
             raise (no_schedules if looks else no_geometry) from None
 
 
-STEPS = ("mechanism", "stroke", "links", "loop", "tables")  # of the schedule page
-
-
 def schedule_step(progress: Progress, step: str, words: list[str], out: str, command: str) -> Any:
     """One step of the scheduling method, by the functions of ``vaneloop schedule``."""
-    import numpy as np
-
-    from plant import load_geometry, load_schedules
-    from plant.geometry import vane_angles
-    from plant.spatial import plane_joints
-    from vaneloop.cli.schedule import log_of
-    from vaneloop.design.links import ScheduleOptions
-    from vaneloop.design.schedule_files import write_tables
-    from vaneloop.design.scheduling import schedule
-    from vaneloop.design.stroke_tables import STROKE_LIMITS, stroke_tables, table_speeds
-    from vaneloop.pages.schedule import NAMES, schedule_page
-
     args = parsed("schedule", words)
     progress(None, "reading")
     geometry, schedules = load_geometry(args.geometry), load_schedules(args.schedules)
@@ -396,31 +323,18 @@ def schedule_step(progress: Progress, step: str, words: list[str], out: str, com
 def fleet_state(progress: Progress, run: str) -> dict[str, Any]:
     """How far a fleet's run is, as ``vaneloop fleet status`` says it, and whether it is a campaign's."""
     needs("a fleet's run", "psutil", "duckdb", "ruptures")
-    from vaneloop.fleet.folder import Folder
-    from vaneloop.fleet.state import state_of
-
     folder = Folder(run)
     return {**state_of(folder).json(), "campaign": folder.of_campaign}
 
 
 def fleet_report(progress: Progress, run: str, logs: str) -> Any:
     """The page that ``vaneloop fleet report`` writes; None for a campaign's run."""
-    from vaneloop.fleet.folder import Folder
-    from vaneloop.fleet.report import view_of
-    from vaneloop.fleet.tables import roll_up
-    from vaneloop.pages.fleet import fleet_page
-
     folder = Folder(run)
     return None if folder.of_campaign else fleet_page(view_of(roll_up(folder), {}, run, folder.damaged), logs=logs)
 
 
 def fleet_log(progress: Progress, run: str, key: str) -> str:
     """The page of one log of a run, as HTML."""
-    from vaneloop.base.errors import InputError
-    from vaneloop.fleet.folder import Folder
-    from vaneloop.fleet.tables import answers
-    from vaneloop.pages.fleet import log_page
-
     found = answers(Folder(run), [key])
     if key not in found:
         raise InputError(f"{run}: has no answer to {key}")
@@ -457,103 +371,6 @@ TASKS: dict[str, Callable[..., Any]] = {
 }
 
 
-# ---- the process -----------------------------------------------------------------------------------------------------
-
-
-def _limit_memory() -> None:
-    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    most = max(LEAST_MEMORY, int(MOST_MEMORY * whole))
-    resource.setrlimit(resource.RLIMIT_AS, (most, most))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-
-
-class Inbox:
-    """What the server tells the task that is running. What comes too late for one that has ended reaches no other."""
-
-    def __init__(self) -> None:
-        self._told: queue.Queue[tuple[int, dict[str, Any]]] = queue.Queue()
-        self._task = 0
-
-    def begin(self, task: int) -> None:
-        """A task begins to run: the number of its question."""
-        self._task = task
-
-    def put(self, task: int, content: dict[str, Any]) -> None:
-        """Tell a task something."""
-        self._told.put((task, content))
-
-    def take(self) -> dict[str, Any] | None:
-        """The next thing that the running task was told, or None."""
-        while True:
-            try:
-                task, content = self._told.get_nowait()
-            except queue.Empty:
-                return None
-            if task == self._task:
-                return content
-
-
-INBOX = Inbox()
-
-
-def main(fd: int, tasks: dict[str, Callable[..., Any]], load: Callable[[Progress], None] | None = None) -> NoReturn:
-    """Answer questions with ``tasks`` until the server is gone; ``load`` what they need before the first one."""
-    connection = Connection(fd)
-    _limit_memory()
-    questions: queue.Queue[Any] = queue.Queue()
-
-    def listen() -> None:
-        try:
-            while True:
-                number, name, arguments = connection.recv()
-                if name == "tell":
-                    INBOX.put(number, arguments)
-                else:
-                    questions.put((number, name, arguments))
-        except (EOFError, OSError):
-            os.killpg(os.getpgrp(), signal.SIGKILL)  # the server is gone, and so is whatever this process has started
-
-    threading.Thread(target=listen, daemon=True).start()
-    sending = threading.Lock()
-    if load is not None:
-        with contextlib.suppress(Exception):  # what fails here fails again when it is asked for, and is told then
-            load(lambda _, text: connection.send(("progress", LOADING, (None, text))))
-        connection.send(("progress", LOADING, (None, "")))
-    while True:
-        number, name, arguments = questions.get()
-        INBOX.begin(number)
-        last = 0.0
-
-        def progress(fraction: float | None, text: Any, number: int = number) -> None:
-            """Tell the page: a fraction and words, or any news of a task that runs on."""
-            nonlocal last
-            now = time.monotonic()
-            if fraction is None or fraction in (0.0, 1.0) or now - last > 0.05:
-                last = now
-                with sending:
-                    connection.send(("progress", number, (fraction, text)))
-
-        try:
-            answer = ("done", number, tasks[name](progress, **arguments))
-        except BaseException as e:
-            answer = ("failed", number, _line(e))
-        with sending:
-            connection.send(answer)
-
-
-def _line(e: BaseException) -> str:
-    """One line for the page: what the command line would say, or the kind of the mistake where it is ours."""
-    from vaneloop.base.errors import InputError
-
-    if isinstance(e, InputError):
-        return str(e)
-    from vaneloop.base.terminal import defect
-
-    return defect(e)
-
-
 if __name__ == "__main__":
-    from vaneloop.base import terminal
-
     os.nice(10)  # the page answers first
-    sys.exit(terminal.run(lambda: main(int(sys.argv[1]), TASKS, ready if "--load" in sys.argv else None)))
+    sys.exit(terminal.run(lambda: answer(int(sys.argv[1]), TASKS, ready if "--load" in sys.argv else None)))

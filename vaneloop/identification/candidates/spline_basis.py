@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 
 from vaneloop.base.curve import DEGREE, splines
 from vaneloop.identification.subsystem import Array, Effect, Parameter
@@ -114,9 +115,6 @@ def basis_of(visited: Array, count: int = COUNT) -> Basis | None:
     Knots stand at their quantiles: a curve is as fine as the log tells.
     """
     x = np.sort(np.asarray(visited, dtype=float)[np.isfinite(visited)])
-    from scipy.interpolate import BSpline
-    from scipy.linalg import eigh
-
     if len(x) < 4 * LEAST:
         return None
     if len(few := np.unique(x)) in (2, 3):
@@ -135,15 +133,15 @@ def basis_of(visited: Array, count: int = COUNT) -> Basis | None:
     knots = np.concatenate([np.zeros(4), inner, np.ones(4)])
     n = len(knots) - DEGREE - 1
     some = z[np.linspace(0, len(z) - 1, min(len(z), 10_000)).astype(int)]
-    values = BSpline.design_matrix(some, knots, DEGREE).toarray()
+    values = scipy.interpolate.BSpline.design_matrix(some, knots, DEGREE).toarray()
     gram = values.T @ values / len(some) + 1e-9 * np.eye(n)
     # cubic pieces: the second derivative is straight in each, so that Simpson's rule takes its square exactly
     edges = np.unique(knots)
     at = np.concatenate([edges[:-1], 0.5 * (edges[1:] + edges[:-1]), edges[1:]])
     weight = np.concatenate([np.full(len(edges) - 1, w) for w in (1.0, 4.0, 1.0)]) * np.tile(np.diff(edges), 3) / 6.0
-    second = BSpline(knots, np.eye(n), DEGREE).derivative(2)(np.minimum(at, np.nextafter(1.0, 0.0))).T
+    second = scipy.interpolate.BSpline(knots, np.eye(n), DEGREE).derivative(2)(np.minimum(at, np.nextafter(1.0, 0.0))).T
     bending = (second * weight) @ second.T
-    bends, turn = eigh(bending, gram)
+    bends, turn = scipy.linalg.eigh(bending, gram)
     # the first two do not bend: a constant, and the straight line that is orthogonal to it
     one = np.ones(n) / np.sqrt(gram.sum())
     line = _greville(knots)

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from vaneloop.identification.candidates.spline_basis import FINE_HARMONICS, HARMONICS
 from vaneloop.identification.subsystem import Array
@@ -80,9 +81,7 @@ def _even(t: Array, rows: Array, straight: bool = True) -> _Even:
 
 def detrended(rows: Array) -> Array:
     """Signals without their straight line."""
-    from scipy.signal import detrend
-
-    return np.asarray(detrend(rows))
+    return np.asarray(scipy.signal.detrend(rows))
 
 
 def _taken(part: _Even) -> Array:
@@ -98,8 +97,6 @@ def _fitted(parts: Sequence[_Even], harmonics: int, numbers: Array, apart: float
     parts    of each log errors, and behind them what a constant would do to each
     numbers  of the frequencies, in ``apart`` (Hz)
     """
-    from scipy.signal import czt
-
     falls, weights = np.zeros((2, 2 * harmonics * int(numbers[-1]) + 1), dtype=complex)
     for part in parts:
         step = float(part.t[1] - part.t[0])
@@ -108,8 +105,8 @@ def _fitted(parts: Sequence[_Even], harmonics: int, numbers: Array, apart: float
         begun = np.exp(-2j * np.pi * f * part.t[0])
         turn = np.exp(-2j * np.pi * apart * step)
         squares = np.sum(part.rows[len(part.rows) // 2 :] ** 2, axis=0)
-        weights += begun * czt(window * squares, len(f), turn)
-        falls += begun * czt(window * np.sum(_taken(part), axis=0), len(f), turn)
+        weights += begun * scipy.signal.czt(window * squares, len(f), turn)
+        falls += begun * scipy.signal.czt(window * np.sum(_taken(part), axis=0), len(f), turn)
     order = np.arange(-harmonics, harmonics + 1)
     at = numbers[:, None] * order
 
@@ -136,9 +133,7 @@ def _spectrum(part: _Even, f: Array) -> Array:
 
 def about(power: Array) -> Array:
     """The median about each line."""
-    from scipy.ndimage import median_filter
-
-    middle = median_filter(power, 2 * FINE * ABOUT + 1, mode="reflect")
+    middle = scipy.ndimage.median_filter(power, 2 * FINE * ABOUT + 1, mode="reflect")
     return np.asarray(np.maximum(middle, 1e-12 * max(float(power.max()), 1e-300)))
 
 
@@ -203,9 +198,7 @@ class Lines:
 
     def _peaks(self, power: Array, least: Array) -> list[float]:
         """Frequencies (Hz) of its lines that are above the ``least``, the highest first."""
-        from scipy.signal import find_peaks
-
-        at = find_peaks(power, least, distance=2 * FINE)[0]
+        at = scipy.signal.find_peaks(power, least, distance=2 * FINE)[0]
         return [float(self.f[k]) for k in sorted(at, key=lambda k: -power[k])]
 
     def _lines(self, parts: Sequence[_Even]) -> list[float]:
@@ -239,10 +232,8 @@ class Lines:
 
 def _highest(parts: Sequence[_Even], f: float, span: float) -> float:
     """The frequency (Hz) near ``f`` that has most power in all logs together."""
-    from scipy.optimize import minimize_scalar
-
     near = (f - 0.5 / span, f + 0.5 / span)
-    found = minimize_scalar(
+    found = scipy.optimize.minimize_scalar(
         lambda g: -_coherent(parts, g), bounds=near, method="bounded", options={"xatol": 1e-3 / span}
     )
     return float(found.x)
@@ -281,8 +272,6 @@ def _driven(c: Course, highest: float) -> _Driven:
 
     A line has one phase all along the log. A drive that has more of what is slow, or swings for a while, has none.
     """
-    from scipy.signal import find_peaks
-
     span = float(c.t[-1] - c.t[0])
     fine = np.arange(1.0 / span, highest, 1.0 / (FINE * span))
     out = _Driven([], [], TOLD / span, [], 2.0 / span)
@@ -293,7 +282,7 @@ def _driven(c: Course, highest: float) -> _Driven:
         power = _spectrum(part, fine)
         share = np.convolve(power, np.ones(2 * FINE + 1), mode="same") / power.sum()
         pieces = [_Even(part.t[k], part.rows[:, k]) for k in np.array_split(np.arange(len(part.t)), PIECES)]
-        for k in find_peaks(power * (share > SHARE), CLEAR * about(power))[0]:
+        for k in scipy.signal.find_peaks(power * (share > SHARE), CLEAR * about(power))[0]:
             f = _highest([part], fine[k], span)
             if _coherence(pieces, f) > STEADY:
                 most = share[k] > MAIN
@@ -380,11 +369,9 @@ def _power(where: Array, row: Array, cells: int) -> Array:
 
 def _peaks(power: Array, span: float, most: float) -> list[tuple[float, float]]:
     """How clear lines are, and their frequencies (1 over the channel's unit)."""
-    from scipy.signal import find_peaks
-
     first, last = int(FINE * CYCLES), min(int(FINE * most), len(power) - 1)
     clear = power / about(power)
-    at = find_peaks(clear[first:last], CLEAR, distance=2 * FINE)[0] + first
+    at = scipy.signal.find_peaks(clear[first:last], CLEAR, distance=2 * FINE)[0] + first
     return [(float(clear[k]), float((k + _between(*power[k - 1 : k + 2])) / (FINE * span))) for k in at]
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import scipy
 
 from plant.model import Learned
 from vaneloop.identification.candidates import laws
@@ -248,8 +249,6 @@ class BoundSystem:
 
     def theta_from(self, other: BoundSystem, theta: Array) -> Array:
         """Parameters of another log's stage as this one's: initial states that no log tells are fitted to this log."""
-        from scipy.optimize import least_squares
-
         n_p = len(self.system.parameters)
         out = np.concatenate(
             [
@@ -274,7 +273,9 @@ class BoundSystem:
 
         self._scan_starts(out, [n_p + i for i, p in enumerate(starts) if np.isinf(p.tolerance)])
         first = out[n_p : n_p + k] / size
-        out[n_p : n_p + k] = least_squares(error, first, bounds=(low, high), diff_step=1e-3, max_nfev=30).x * size
+        out[n_p : n_p + k] = (
+            scipy.optimize.least_squares(error, first, bounds=(low, high), diff_step=1e-3, max_nfev=30).x * size
+        )
         return out
 
     def errors(self, theta: Array) -> dict[str, Array]:
@@ -349,8 +350,6 @@ class BoundSystem:
 
     def _prefit(self, parameters: Sequence[Parameter]) -> Array:
         """Values of the unknown parameters that suit the logs best while nothing is added."""
-        from scipy.optimize import least_squares
-
         values = np.array([p.value for p in parameters], dtype=float)
         free = [i for i, p in enumerate(parameters) if np.isinf(p.tolerance)]
         scale = np.nanstd(self.measured, axis=1)
@@ -391,9 +390,11 @@ class BoundSystem:
             self._choose_steps(self._with(values, free, drawn[0] * size))
         begins = [given, *drawn] if stays else drawn
         begins += self._in_windows(error, begins, low, high)
-        fits = [least_squares(error, b, bounds=(low, high), diff_step=1e-4, max_nfev=20) for b in begins]
+        fits = [scipy.optimize.least_squares(error, b, bounds=(low, high), diff_step=1e-4, max_nfev=20) for b in begins]
         fits.sort(key=lambda f: f.cost)
-        again = [least_squares(error, f.x, bounds=(low, high), diff_step=1e-4, max_nfev=60) for f in fits[:2]]
+        again = [
+            scipy.optimize.least_squares(error, f.x, bounds=(low, high), diff_step=1e-4, max_nfev=60) for f in fits[:2]
+        ]
         best = min(again, key=lambda f: f.cost)
         self.others = []
         for f in fits:  # other valleys
@@ -410,15 +411,13 @@ class BoundSystem:
 
         A free run from wrong values loses its phase, and its error many valleys; a short one does neither.
         """
-        from scipy.optimize import least_squares
-
         s, data = self.system, self.data
         measured = all(n in s.outputs or (n in s.rates and s.rates[n] in s.outputs) for n in s.states)
         if s.window or s.kind != "simulate" or not s.rates or not measured:
             return []
         data.window = max(data.records[0].t[-1] / WINDOWS, LEAST_WINDOW * float(np.median(np.diff(data.records[0].t))))
         first = min(begins, key=lambda z: float(np.sum(error(z) ** 2)))
-        best = least_squares(error, first, bounds=(low, high), diff_step=1e-4, max_nfev=20).x
+        best = scipy.optimize.least_squares(error, first, bounds=(low, high), diff_step=1e-4, max_nfev=20).x
         data.window = None
         return [best]
 
@@ -434,10 +433,8 @@ class BoundSystem:
         come nearest to the logs, as they are or but for a gain and an offset of each output; none that leaves all
         bounds.
         """
-        from scipy.stats import qmc
-
         power = min(4 + len(free), MOST_DRAWN)
-        unit, drawn = qmc.Sobol(len(free), seed=0).random_base2(power), 2**power
+        unit, drawn = scipy.stats.qmc.Sobol(len(free), seed=0).random_base2(power), 2**power
         z = np.clip(np.where(first == 0.0, 2.0 * unit - 1.0, first * FACTOR ** (2.0 * unit - 1.0)), low, high)
         thetas = np.repeat(values[None], drawn, axis=0)
         thetas[:, free] = z * size

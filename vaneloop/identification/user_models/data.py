@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
+import scipy
 
 from vaneloop.base.sizes import LARGEST, beyond, no_smaller
 from vaneloop.identification.subsystem import Array, StageError
@@ -71,8 +73,6 @@ class Data:
         s = self.system
         for c in s.channels():
             if c not in r.columns and c not in s.optional():
-                import difflib
-
                 close = difflib.get_close_matches(c, r.columns, 1)
                 hint = f"; close: {close[0]}" if close else ""
                 raise StageError(
@@ -296,13 +296,11 @@ def noise_of_channel(y: Array) -> float:
 
 def _quiet(y: Array) -> tuple[float, float]:
     """Third differences where they are small, and the spectrum where it is."""
-    from scipy.signal import welch
-
     d = np.diff(y, 3)
     width = max(10, len(d) // 60)
     parts = d[: len(d) // width * width].reshape(-1, width)
     level = np.sort(np.sqrt(np.mean(parts**2, axis=1) / 20.0))
-    _, power = welch(y, 1.0, nperseg=min(1024, len(y) // 4))
+    _, power = scipy.signal.welch(y, 1.0, nperseg=min(1024, len(y) // 4))
     return float(np.median(level[: max(1, len(level) // 2)])), float(np.sqrt(np.quantile(power[1:], 0.1) * 0.5))
 
 

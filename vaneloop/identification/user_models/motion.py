@@ -7,6 +7,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import scipy
 
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.user_models.system import Record, System
@@ -59,11 +60,9 @@ def differentiated_to(s: System, records: Sequence[Record], cutoff: float) -> fl
 
 def _spectrum(r: Record, channel: str) -> tuple[Array, Array, float]:
     """Frequencies (Hz) and power of a channel, and that of its white noise."""
-    from scipy.signal import welch
-
     y = r.columns[channel]
     y = np.where(np.isfinite(y), y, np.nanmean(y))
-    f, power = welch(y - y.mean(), 1.0 / float(np.median(np.diff(r.t))), nperseg=min(4096, len(y)))
+    f, power = scipy.signal.welch(y - y.mean(), 1.0 / float(np.median(np.diff(r.t))), nperseg=min(4096, len(y)))
     return f, power, float(np.quantile([part.mean() for part in np.array_split(power, PARTS)], 0.25))
 
 
@@ -71,11 +70,9 @@ def motion(s: System, r: Record, cutoff: float | None) -> tuple[Array, Array, Ar
     """Displacement, velocity and acceleration of a log, differentiated up to ``cutoff`` (Hz; None: as measured); a
     displacement that is not measured is integrated from 0.
     """
-    from scipy.integrate import cumulative_trapezoid
-
     if s.position is None:  # the position at the start is added where it is known (`Runner`)
         v = r.columns[str(s.velocity)]
-        x = cumulative_trapezoid(v, r.t, initial=0.0)
+        x = scipy.integrate.cumulative_trapezoid(v, r.t, initial=0.0)
         if not cutoff:
             return x, v, np.zeros(len(v))
         x, v = low_pass(r.t, x, cutoff), low_pass(r.t, v, cutoff)
@@ -90,23 +87,19 @@ def motion(s: System, r: Record, cutoff: float | None) -> tuple[Array, Array, Ar
 
 def _derivative(t: Array, x: Array) -> Array:
     """That of a cubic spline through all samples."""
-    from scipy.interpolate import CubicSpline
-
-    return np.asarray(CubicSpline(t, x)(t, 1))
+    return np.asarray(scipy.interpolate.CubicSpline(t, x)(t, 1))
 
 
 def low_pass(t: Array, x: Array, cutoff: float) -> Array:
     """Zero-phase low-pass that looks no farther than one period of ``cutoff`` (Hz) to either side: farther from its
     ends a log is filtered exactly, and so is what is linear in it. Beyond its ends it goes on mirrored.
     """
-    from scipy.signal import oaconvolve
-
     good = np.isfinite(x)
     if not good.all():
         x = np.interp(t, t[good], x[good]) if good.any() else np.zeros(len(x))
     kernel = _kernel(min(cutoff * float(np.median(np.diff(t))), 0.475))
     more, mean = len(kernel) // 2, float(np.mean(x))
-    return np.asarray(oaconvolve(np.pad(x - mean, more, mode="symmetric"), kernel, mode="valid") + mean)
+    return np.asarray(scipy.signal.oaconvolve(np.pad(x - mean, more, mode="symmetric"), kernel, mode="valid") + mean)
 
 
 @lru_cache(maxsize=64)
@@ -125,22 +118,20 @@ def _kernel(cutoff: float) -> Array:
 
 def _butterworth(t: Array, x: Array, cutoff: float) -> Array:
     """Zero-phase fourth-order Butterworth filter."""
-    from scipy.signal import butter, sosfiltfilt
-
     rate = 1.0 / float(np.median(np.diff(t)))
     good = np.isfinite(x)
     if not good.all():
         x = np.interp(t, t[good], x[good]) if good.any() else np.zeros(len(x))
-    return np.asarray(sosfiltfilt(butter(4, min(cutoff / (0.5 * rate), 0.95), output="sos"), x))
+    return np.asarray(
+        scipy.signal.sosfiltfilt(scipy.signal.butter(4, min(cutoff / (0.5 * rate), 0.95), output="sos"), x)
+    )
 
 
 def smoothed(t: Array, x: Array) -> Array:
     """A measured displacement, smooth enough to be differentiated once, with all that moves it."""
-    from scipy.signal import welch
-
     rate = 1.0 / float(np.median(np.diff(t)))
     y = np.where(np.isfinite(x), x, np.nanmean(x))
-    f, power = welch(y - y.mean(), rate, nperseg=min(4096, len(y)))
+    f, power = scipy.signal.welch(y - y.mean(), rate, nperseg=min(4096, len(y)))
     total = np.cumsum(power)
     highest = float(f[int(np.searchsorted(total, FORCE_SHARE * total[-1]))])
     return _butterworth(t, x, min(max(0.05 * rate, 1.5 * highest), 0.4 * rate))

@@ -20,6 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from vaneloop.base.curve import FINE, POINTS
 from vaneloop.base.forms import Form
@@ -224,11 +225,9 @@ class Surface(Curve):
 
     def at(self, q: Array, table: Array) -> Array:
         """The surface at values of its quantities, float64[2, n]."""
-        from scipy.ndimage import map_coordinates
-
         low, high = np.array([[self.low], [self.low_second]]), np.array([[self.high], [self.high_second]])
         at = np.clip((q - low) / (high - low), 0.0, 1.0) * (np.array([table.shape]).T - 1)
-        return np.asarray(map_coordinates(table, at, order=1))
+        return np.asarray(scipy.ndimage.map_coordinates(table, at, order=1))
 
 
 def apart(active: Active) -> tuple[Active, Sequence[tuple[Surface, Array]]]:
@@ -239,11 +238,11 @@ def apart(active: Active) -> tuple[Active, Sequence[tuple[Surface, Array]]]:
 
 def _spread(table: Array, points: int) -> Array:
     """The same table with so many points each way."""
-    from scipy.ndimage import map_coordinates
-
     at = np.linspace(0.0, len(table) - 1.0, points)
     return np.asarray(
-        table if len(table) == points else map_coordinates(table, np.meshgrid(at, at, indexing="ij"), order=1)
+        table
+        if len(table) == points
+        else scipy.ndimage.map_coordinates(table, np.meshgrid(at, at, indexing="ij"), order=1)
     )
 
 

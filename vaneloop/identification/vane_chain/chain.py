@@ -21,7 +21,7 @@ from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import binary_propagation
+import scipy
 
 from controller import Calibration, load_calibration
 from controller.records import RUN
@@ -136,7 +136,7 @@ def build_chain(
         )
     dt = float(t[1] - t[0])
     # after a gap everything is as at the start of a log: what the stages remember must come from the rows behind it
-    fresh = ~binary_propagation(~fresh, mask=~fresh | lacking)
+    fresh = ~scipy.ndimage.binary_propagation(~fresh, mask=~fresh | lacking)
     stretch = stretches(fresh)
     usable = fresh & (since(t, stretch) >= SETTLE) & no_gap_in_window(t, fresh)
     run = law_holds = machine_rows = currents = usable

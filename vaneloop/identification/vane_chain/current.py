@@ -7,8 +7,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import lstsq
-from scipy.ndimage import convolve1d, uniform_filter1d
+import scipy
 
 from controller import Calibration
 from hil.figures import noise_floor, resolution
@@ -130,7 +129,7 @@ def between_rows(
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal(law.shape)
     noise[:, -1] = 0.0
-    slow = uniform_filter1d(c["i_cmd"] - law.mean(axis=1), SMOOTH[-1])  # the integral's constant
+    slow = scipy.ndimage.uniform_filter1d(c["i_cmd"] - law.mean(axis=1), SMOOTH[-1])  # the integral's constant
     ticks = law + slow[:, None] + size * noise
     # the row's own tick is known; the others' noise was such that the mean comes out
     ticks[:, :-1] += (c["i_cmd"] - ticks.mean(axis=1))[:, None] * (law.shape[1] / (law.shape[1] - 1.0))
@@ -217,7 +216,7 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = 
                  known=known)  # fmt: skip
     step = np.diff(out[:, 0], prepend=1e3) * 1e3
     logged = np.diff(c["x_lvdt"], prepend=c["x_lvdt"][0])
-    whole = uniform_filter1d(c["fresh"], 5) > 0.999  # rows with their neighbours
+    whole = scipy.ndimage.uniform_filter1d(c["fresh"], 5) > 0.999  # rows with their neighbours
     calibrated = _calibrated(step, dt, logged, whole)
     model = np.cumsum(np.where(whole, calibrated, logged))  # over a gap the model goes where the stroke went
     off = c["x_lvdt"] - model
@@ -238,9 +237,11 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = 
     bent = np.maximum(
         _above_noise(differs, wide - narrow, noise, around), _above_noise(off - smooth, as_is - wide, noise, around)
     )
-    distortion = differs * np.sqrt(bent / np.maximum(uniform_filter1d(differs**2, around), 1e-300))
+    distortion = differs * np.sqrt(bent / np.maximum(scipy.ndimage.uniform_filter1d(differs**2, around), 1e-300))
     # and what the model of the motion leaves at each row, in proportion to how fast the motion changes: least squares
-    jerky = uniform_filter1d((calibrated - uniform_filter1d(calibrated, SMOOTH[0])) ** 2, around)
+    jerky = scipy.ndimage.uniform_filter1d(
+        (calibrated - scipy.ndimage.uniform_filter1d(calibrated, SMOOTH[0])) ** 2, around
+    )
     jerky = np.maximum(jerky, 0.0)  # a running sum of squares may end a rounding below 0
     weights = as_is - wide
     more = (off - smooth) ** 2 - float(weights @ weights) * noise**2 - bent
@@ -279,12 +280,12 @@ def _calibrated(step: Array, dt: float, logged: Array, whole: Array) -> Array:
 def _weights(rows: int) -> Array:
     """Weights over ``rows`` of a cubic fitted to them, for its value in their middle."""
     x = np.arange(rows // 2, -(rows // 2) - 1, -1.0)
-    return np.asarray(lstsq(x ** np.arange(SMOOTH_ORDER + 1)[:, None], np.eye(SMOOTH_ORDER + 1)[0])[0])
+    return np.asarray(scipy.linalg.lstsq(x ** np.arange(SMOOTH_ORDER + 1)[:, None], np.eye(SMOOTH_ORDER + 1)[0])[0])
 
 
 def _smoothed(x: Array, rows: int) -> Array:
     """A cubic fitted over ``rows`` around each row; the first and the last half of them lie on one cubic."""
-    out, half, at = np.asarray(convolve1d(x, _weights(rows), mode="constant")), rows // 2, np.arange(rows)
+    out, half, at = np.asarray(scipy.ndimage.convolve1d(x, _weights(rows), mode="constant")), rows // 2, np.arange(rows)
     out[:half] = np.polyval(np.polyfit(at, x[:rows], SMOOTH_ORDER), at[:half])
     out[-half:] = np.polyval(np.polyfit(at, x[-rows:], SMOOTH_ORDER), at[-half:])
     return out
@@ -309,5 +310,5 @@ def _above_noise(values: Array, weights: Array, noise: float, around: int) -> Ar
     """
     alike = np.correlate(weights, weights, "full") / (weights @ weights)
     chance = noise**2 * float(weights @ weights)
-    power = uniform_filter1d(values**2, around)
+    power = scipy.ndimage.uniform_filter1d(values**2, around)
     return np.where(power > chance * (1.0 + 3.0 * np.sqrt(2.0 / around * float(alike @ alike))), power - chance, 0.0)

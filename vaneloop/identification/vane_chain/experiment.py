@@ -5,15 +5,33 @@ profiles.
 from __future__ import annotations
 
 import itertools
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
+
+from hil.logs import Channel, Log
+from hil.loop.lockstep import Stimulus, lockstep
+from plant import Model, build_plant
+from plant.effects import EFFECTS
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.selection.diagnosis import floor_of
+from vaneloop.identification.selection.likelihood_acceptance import (
+    NATS,
+    RIVAL_SPREADS,
+    LikelihoodAcceptance,
+    correlation_of,
+    gain,
+)
+from vaneloop.identification.selection.search import Search
+from vaneloop.identification.vane_chain.chain import build_chain
 
 if TYPE_CHECKING:
     from controller import Calibration
     from plant import Plant
 
-__all__ = ["MARGIN", "MOST_REPEATS", "PROFILES", "divergence", "recommend"]
+__all__ = ["MARGIN", "MOST_REPEATS", "divergence", "profiles", "recommend"]
 
 MOST_REPEATS = 4  # of a profile, where once does not decide
 
@@ -26,13 +44,13 @@ def _piecewise(points: list[tuple[float, float]]) -> np.ndarray:
 
 
 def _sine(middle: float, size: float, low_hz: float, high_hz: float, seconds: float) -> np.ndarray:
-    from scipy.signal import chirp
-
     t = np.arange(0.0, seconds, 0.01)
-    return middle + size * chirp(t, low_hz, seconds, high_hz, phi=-90)
+    return middle + size * scipy.signal.chirp(t, low_hz, seconds, high_hz, phi=-90)
 
 
-def _bank() -> dict[str, np.ndarray]:
+@cache
+def profiles() -> dict[str, np.ndarray]:
+    """Safe profiles of the rotor speed's demand, %, every 10 ms, by what they are."""
     stairs: list[tuple[float, float]] = [(0, 60)]
     for k, n in enumerate([65, 70, 75, 80, 85, 90, 95, 99, 95, 90, 85, 80, 75, 70, 65, 60]):
         stairs += [(4 + 7 * k, stairs[-1][1]), (5 + 7 * k, n)]
@@ -58,9 +76,6 @@ def _bank() -> dict[str, np.ndarray]:
     }
 
 
-PROFILES = _bank()
-
-
 def divergence(
     profile: np.ndarray,
     truth: dict[str, dict[str, float]],
@@ -81,15 +96,6 @@ def divergence(
 
     Returns (nats, spreads), the two measures by which the diagnosis decides.
     """
-    from hil.logs import Channel, Log
-    from hil.loop.lockstep import Stimulus, lockstep
-    from plant import Model, build_plant
-    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
-    from vaneloop.identification.selection.diagnosis import floor_of
-    from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, correlation_of, gain
-    from vaneloop.identification.selection.search import Search
-    from vaneloop.identification.vane_chain.chain import build_chain
-
     t = np.arange(len(profile)) * 1e-2
     warm = 40.0 + 30.0 * (1.0 - np.exp(-t / 60.0))  # oil warms up in any run
     machine = plant or build_plant()
@@ -140,16 +146,14 @@ def recommend(d: Any, progress: Any = None, chain: Any = None) -> dict[str, Any]
 
     ``score`` is the smallest divergence over all pairs and all ``repeats``, in nats.
     """
-    from plant.effects import EFFECTS
-    from vaneloop.identification.selection.likelihood_acceptance import NATS, RIVAL_SPREADS
-
     pairs = [(s, f, rival) for s in d.stages for f in s.effects for rival in f.rivals[:3]]
     if not pairs:
         return None
     machine = {} if chain is None else {"plant": chain.plant, "calibration": chain.built}
     table: list[dict[str, Any]] = []
-    jobs = list(itertools.product(PROFILES.items(), pairs))
-    scores: dict[str, list[tuple[float, float]]] = {name: [] for name in PROFILES}
+    bank = profiles()
+    jobs = list(itertools.product(bank.items(), pairs))
+    scores: dict[str, list[tuple[float, float]]] = {name: [] for name in bank}
     truth: dict[str, dict[str, float]] = {}  # an effect that shows in two stages was fitted in both; the first will do
     for f in (f for s in d.stages for f in s.effects):
         known = [p.name for p in EFFECTS[f.effect].parameters]
@@ -169,7 +173,7 @@ def recommend(d: Any, progress: Any = None, chain: Any = None) -> dict[str, Any]
         table.append({"profile": name, "nats": nats, "repeats": runs, "needed": needed, "by_pair": by_pair})
     table.sort(key=lambda r: r["needed"])
     best = table[0]
-    once = PROFILES[best["profile"]]
+    once = bank[best["profile"]]
     repeats = max(1, best["repeats"])
     profile = np.tile(once, repeats)
     separated = best["repeats"] > 0
