@@ -44,7 +44,7 @@ from plant.stages.blocks import on_all_cores
 from vaneloop.base.compiled import compiled, in_place_free
 from vaneloop.base.vanes import VANES
 
-__all__ = ["Lanes", "lockstep_lanes"]
+__all__ = ["Lanes", "for_each", "lockstep_lanes"]
 
 EIGHT = 8  # lanes of a vector: a block runs a multiple of it
 LINE = 64  # bytes of a line of the cache
@@ -146,11 +146,11 @@ def lockstep_lanes(
     """
     if CHUNK % every:
         raise ValueError(f"every (={every}) must divide {CHUNK}")
-    stimuli = _for_each(stimulus, Stimulus, len(plants), "stimulus")
+    stimuli = for_each(stimulus, Stimulus, len(plants), "stimulus")
     lengths = {len(s.rows) for s in stimuli}
     if len(lengths) > 1:
         raise ValueError(f"stimuli (={sorted(lengths)} rows) must be equally long")
-    cals = _for_each(calibrations or load_calibration(), Calibration, len(plants), "calibrations")
+    cals = for_each(calibrations or load_calibration(), Calibration, len(plants), "calibrations")
     blocks: dict[Any, list[int]] = {}  # loops that can stand in one block
     loops: dict[int, Loop] = {}
     alone: list[int] = []
@@ -182,7 +182,7 @@ def lockstep_lanes(
     return [runs[i] for i in range(len(plants))]
 
 
-def _for_each(one_or_many: Any, kind: type, count: int, name: str) -> list[Any]:
+def for_each(one_or_many: Any, kind: type, count: int, name: str) -> list[Any]:
     """A list of ``count``: what was given once, or for each."""
     many = [one_or_many] * count if isinstance(one_or_many, kind) else list(one_or_many)
     if len(many) != count:

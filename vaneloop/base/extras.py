@@ -20,6 +20,7 @@ EXTRAS = {
     "diagnostics": {"isotp": "can-isotp"},
     "multibody": {"exudyn": "exudyn"},
     "secoc": {"cryptography": "cryptography"},
+    "gpu": {"numba_cuda": "numba-cuda"},
 }  # fmt: skip
 
 

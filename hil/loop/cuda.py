@@ -1,0 +1,316 @@
+"""The closed loop as a kernel for a GPU: a thread is an engine with its controller, plant and sensors.
+
+numba-cuda compiles the kernel from the same Python functions that the processor runs: `controller.firmware.tick`,
+`plant.chain` and all that they call. Products and sums are not fused into one rounding, so firmware and actuator have
+the same bits as on the processor; sines and arctangents, which only the vane angles need, agree to rounding.
+
+Where numba's simulator stands in for a GPU (NUMBA_ENABLE_CUDASIM=1), Python interprets the same functions.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dis
+import importlib
+import math
+from collections.abc import Iterator
+from functools import cache, partial
+from itertools import pairwise
+from types import FunctionType, ModuleType
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import numba
+import numpy as np
+
+from controller.firmware import tick
+from controller.records import (
+    INPUT_FIELDS,
+    MODES,
+    SLOW,
+    STATE,
+    STATE_FIELDS,
+    as_inputs,
+    as_outputs,
+    as_scalars,
+    as_state,
+    kind,
+)
+from controller.schedule import look_up
+from controller.strategies import filter_pots, inverse_step, learn
+from hil.loop.lockstep import S_FRESH, S_MODE_REQUEST, S_N_DEM, S_N_R, S_P_S, S_REJECTED, S_T_OIL
+from plant import chain, curve
+from plant.chain import SUBSTEPS, TICK, drive_step, rotor_step, sample_lvdt, vane_step
+from plant.effects import CURVES
+from plant.places import N_R, POT
+from vaneloop.base.errors import InputError
+from vaneloop.base.extras import needs
+from vaneloop.base.vanes import MOST
+
+__all__ = [
+    "ANGLE_ERROR",
+    "ANGLE_LAST",
+    "FOUND",
+    "LAST_MODE",
+    "LAST_STROKE",
+    "LOST",
+    "NUMBERS",
+    "P_ROWS",
+    "SAMPLES",
+    "SERVO",
+    "S_ROWS",
+    "Z_ROWS",
+    "Kernel",
+    "kernel",
+    "said",
+    "unusable",
+]  # fmt: skip
+
+# what a thread finds out about its engine: largest error of the stroke (m), number of samples that are no
+# number, mode and stroke (m) at the last sample, samples in each mode; of each stage the largest error of
+# its angle and the angle at the last sample (rad)
+SERVO, LOST, LAST_MODE, LAST_STROKE, SAMPLES = range(5)
+ANGLE_ERROR = SAMPLES + len(MODES)
+ANGLE_LAST = ANGLE_ERROR + MOST
+FOUND = ANGLE_LAST + MOST
+# rows of the firmware's state that the strategies of curves have; of the plant's state and parameters, without curves
+Z_ROWS, S_ROWS, P_ROWS = STATE.index("speed"), curve.S_CURRENT + 1, CURVES + 1
+NUMBERS = Z_ROWS + S_ROWS + P_ROWS + FOUND + 1  # of an engine, beside the noise of its sensors
+THREADS = 128  # of a block
+NOTHING_TO_COMPILE = "NVIDIA's compiler is missing: pip install 'numba-cuda[cu13]'"
+
+cuda: Any = None  # numba.cuda, in the kernel's own copy of these names
+_Inputs, _State = kind(INPUT_FIELDS), kind(STATE_FIELDS)
+
+
+class _Calibration(NamedTuple):
+    """What `tick` takes of a calibration: scalars (a record), stroke table, angle table."""
+
+    k: Any
+    table: Any
+    angles: Any
+
+
+def _mover(put: bool) -> Any:
+    """Function (rows, lane, record) that fills the firmware's state from ``rows``; ``put``: the rows from the state."""
+    lines, row = [], 0
+    for f in STATE_FIELDS:
+        for own in [f"v.{f.name}[{q}]" for q in range(len(f.each))] or [f"v.{f.name}"]:
+            if row < Z_ROWS:
+                lines.append(f"    z[{row}, j] = {own}\n" if put else f"    {own} = z[{row}, j]\n")
+            row += 1
+    space: dict[str, Any] = {}
+    exec(f"def f(z, j, v):\n{''.join(lines)}", space)  # noqa: S102
+    return space["f"]
+
+
+_take, _put = _mover(False), _mover(True)
+
+
+def _same(row: Any) -> Any:
+    """A record as a record."""
+    return row
+
+
+def _nothing(*_: Any) -> None:
+    """What only strategies inverse and adaptive, curves and motors need: these engines have none."""
+
+
+def _zero(s: Any, p: Any, j: int, site: int) -> float:
+    """What the curves of a machine without curves give."""
+    return 0.0
+
+
+def _run(
+    k0: int, ticks: int, every: int, last: int, stimuli: Any, which: Any, noise: Any, sigma: Any, own: Any,
+    scalars: Any, tables: Any, angles: Any, targets: Any, s: Any, p: Any, z: Any, found: Any,
+) -> None:  # fmt: skip
+    """Advance each engine by ``ticks`` ticks from tick ``k0``, a multiple of 10: the loop of `hil.loop.lockstep`.
+
+    every     ticks between two samples that count, from tick 0 on; ``last``: tick of the last one
+    stimuli, which  float64[:, frames, N_STIMULUS], and which of them each engine has
+    noise     float64[ticks or 1, 2 + stages] standard normal numbers, the same for every engine
+    sigma     float64[2 + stages, engine], of the sensors
+    own       which calibration each engine has: records ``scalars``, float64[:, 4, points] ``tables``,
+              float64[:, 1 + stages, points] ``angles``
+    targets   float64[1 + stages, points] speed (%) and each stage's target (rad) at it
+    s, p, z   rows of the plant's state and parameters and of the firmware's state, float64[row, engine]
+    found     float64[FOUND, engine]
+    """
+    j = cuda.grid(1)
+    if j >= s.shape[1]:
+        return
+    inputs_here, state_here = cuda.local.array(1, _Inputs), cuda.local.array(1, _State)
+    inputs, state = inputs_here[0], state_here[0]
+    _take(z, j, state)
+    c = own[j]
+    cal = _Calibration(scalars[c], tables[c], angles[c])
+    rows, stages = stimuli[which[j]], targets.shape[0] - 1
+    last_frame, noisy = rows.shape[0] - 1, noise.shape[0] > 1
+    n_dem = heard = p_s = t_oil = 0.0
+    inputs.pause = 0.0
+    for i in range(ticks):
+        k = k0 + i
+        m = i if noisy else 0
+        if k % SLOW == 0:
+            frame = min(max(k // SLOW, 0), last_frame)
+            n_dem, p_s, t_oil = rows[frame, S_N_DEM], rows[frame, S_P_S], rows[frame, S_T_OIL]
+            heard = rows[frame, S_N_R]
+            if heard != heard:
+                heard = s[N_R, j] + sigma[1 + stages, j] * noise[m, 1 + stages]
+            inputs.n_dem, inputs.n_r, inputs.mode_request = n_dem, heard, rows[frame, S_MODE_REQUEST]
+            inputs.demand_fresh, inputs.demand_rejected = rows[frame, S_FRESH], rows[frame, S_REJECTED]
+        else:
+            inputs.demand_fresh = 0.0
+            inputs.demand_rejected = 0.0
+        inputs.x_lvdt = sample_lvdt(s, p, j, sigma[0, j] * noise[m, 0], t_oil)
+        tick(inputs, state, cal)
+        if k >= 0 and k % every == 0:
+            error = abs(state.x_dem - inputs.x_lvdt)
+            lost = not error < np.inf
+            found[SERVO, j] = max(found[SERVO, j], error)
+            found[SAMPLES + int(state.mode), j] += 1.0
+            for q in range(stages):
+                angle = s[POT + q, j] + sigma[1 + q, j] * noise[m, 1 + q]
+                error = abs(angle - look_up(0, 1 + q, targets, heard))
+                lost = lost or not error < np.inf
+                found[ANGLE_ERROR + q, j] = max(found[ANGLE_ERROR + q, j], error)
+                if k == last:
+                    found[ANGLE_LAST + q, j] = angle
+            if lost:
+                found[LOST, j] += 1.0
+            if k == last:
+                found[LAST_MODE, j], found[LAST_STROKE, j] = state.mode, inputs.x_lvdt
+        rotor_step(s, p, j, n_dem, TICK)
+        drive_step(s, p, j, state.i_cmd, heard, p_s, t_oil, TICK, SUBSTEPS)
+        vane_step(s, p, j, heard, t_oil, (k + 1) * TICK)
+    _put(z, j, state)
+
+
+class _Copies:
+    """Functions of this program as functions of a GPU: copies, with all that they call.
+
+    here     numba.cuda
+    instead  what stands in the place of a function that the processor has
+    """
+
+    def __init__(self, here: Any, instead: dict[Any, Any], interpreted: bool):
+        self._cuda, self._interpreted = here, interpreted
+        self._made: dict[int, Any] = {id(was): self.device(new) for was, new in instead.items()}
+        self._keep = list(instead)
+
+    def device(self, function: Any) -> Any:
+        """A Python function as one of the GPU's."""
+        if self._interpreted or not isinstance(function, FunctionType):
+            return function
+        return self._cuda.jit(device=True, forceinline=True)(function)
+
+    def of(self, value: Any, attributes: set[str]) -> Any:
+        """What stands for ``value``; of a module, for those of its ``attributes`` that are used."""
+        if id(value) in self._made:
+            return self._made[id(value)]
+        if isinstance(value, ModuleType):
+            members = {a: getattr(value, a) for a in attributes}
+            copies = {a: self.of(member, set()) for a, member in members.items()}
+            if all(copies[a] is member for a, member in members.items()):
+                return value
+            copied = ModuleType(value.__name__)
+            copied.__dict__.update(copies)
+            return copied
+        if (python := getattr(value, "py_func", None)) is None:
+            return value
+        self._made[id(value)] = made = self.device(self.copy(python))
+        self._keep.append(value)
+        return made
+
+    def copy(self, python: Any, **more: Any) -> Any:
+        """A Python function that calls the copies; ``more``: names that it has besides."""
+        used: dict[str, set[str]] = {}
+        for before, now in pairwise([None, *dis.get_instructions(python)]):
+            if now.opname == "LOAD_GLOBAL":
+                used.setdefault(now.argval, set())
+            elif now.opname in ("LOAD_ATTR", "LOAD_METHOD") and before.opname == "LOAD_GLOBAL":
+                used[before.argval].add(now.argval)
+        space = {n: self.of(python.__globals__[n], used[n]) for n in used if n in python.__globals__ and n not in more}
+        copied = FunctionType(python.__code__, {**space, **more}, python.__name__, python.__defaults__)
+        copied.__kwdefaults__, copied.__qualname__ = python.__kwdefaults__, python.__qualname__
+        copied.__module__ = python.__module__
+        return copied
+
+
+class Kernel:
+    """`_run` on this computer's GPU."""
+
+    def __init__(self) -> None:
+        here = _cuda()
+        if not here.is_available():
+            raise here.cudadrv.error.CudaSupportError(f"no GPU can be used: {here.cuda_error() or NOTHING_TO_COMPILE}")
+        self.cuda, self.simulated = here, bool(here.config.ENABLE_CUDASIM)
+        self.name = "numba's simulator" if self.simulated else here.get_current_device().name
+        if isinstance(self.name, bytes):
+            self.name = self.name.decode()
+        views = () if self.simulated else (as_inputs, as_outputs, as_scalars, as_state)
+        instead: dict[Any, Any] = dict.fromkeys(views, _same)
+        instead |= dict.fromkeys((inverse_step, learn, filter_pots, curve.acts, chain._motor_step), _nothing)
+        instead[curve.bend] = _zero
+        if not self.simulated:
+            instead[np.floor] = math.floor  # on a GPU it gives a floating-point number, of infinity too
+        copies = _Copies(here, instead, self.simulated)
+        records = (_Inputs, _State) if self.simulated else map(numba.from_dtype, (_Inputs, _State))
+        names = dict(zip(("_Inputs", "_State"), records, strict=True))
+        self.function = copies.copy(_run, cuda=here, _take=copies.device(_take), _put=copies.device(_put), **names)
+        self._kernel = here.jit(self.function)
+
+    def room(self, each: int, share: float, most: int) -> int:
+        """How many engines of so many bytes ``each`` fit into a ``share`` of the GPU's free memory, at ``most``.
+
+        Raises MemoryError where not even one block of threads does.
+        """
+        free = self.cuda.current_context().get_memory_info().free
+        fit = min(share * free / each, most) // THREADS * THREADS
+        if fit < THREADS:
+            raise MemoryError(f"{free / 2**20:.1f} MiB of its memory are free, {THREADS * each / 2**20:.1f} are needed")
+        return int(fit)
+
+    def __call__(self, engines: int, *arguments: Any) -> None:
+        """Run it for so many engines; arguments as of `_run`, arrays those of the GPU."""
+        with _unfused(self.cuda):  # the first call compiles
+            self._kernel[-(-engines // THREADS), min(THREADS, engines)](*arguments)
+
+
+def _cuda() -> Any:
+    """numba-cuda. Raises InputError where it is not installed."""
+    needs("device='cuda'", "numba_cuda")
+    return importlib.import_module("numba.cuda")
+
+
+@contextlib.contextmanager
+def _unfused(here: Any) -> Iterator[None]:
+    """Compile without fused products and sums: numba-cuda has no option for it, its compiler has."""
+    if here.config.ENABLE_CUDASIM:
+        yield
+        return
+    nvvm = here.cudadrv.nvvm
+    with patch.object(nvvm, "compile_ir", partial(nvvm.compile_ir, fma=0)):
+        yield
+
+
+def unusable() -> tuple[type[Exception], ...]:
+    """What is raised where a GPU cannot be used, or fails."""
+    found: list[type[Exception]] = [InputError, ImportError, MemoryError, RuntimeError]
+    with contextlib.suppress(InputError, ImportError):
+        e = _cuda().cudadrv.error
+        found += [getattr(e, n) for n in ("CudaDriverError", "NvvmError", "NvrtcError") if hasattr(e, n)]
+    return tuple(found)
+
+
+def said(e: Exception) -> str:
+    """What such an error says, in one line."""
+    lines = [line.strip() for line in str(e).splitlines() if line.strip(" :")]
+    return " ".join(lines)[:300] or type(e).__name__
+
+
+@cache
+def kernel() -> Kernel:
+    """The kernel, compiled when it first runs. Raises one of `unusable` where there is none."""
+    return Kernel()

@@ -1,0 +1,277 @@
+"""Very many closed loops, on a GPU where there is one: what became of each engine, without its log.
+
+Where `hil.loop.lanes` returns the whole log of each loop, this keeps the figures that a campaign judges: the largest
+errors of stroke and vane angles, the time in each mode, where the engine stands at the end. They are taken on the
+raster of the log while the loop runs.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from controller import Calibration, load_calibration, new_state
+from controller.records import MODES, SCALAR_FIELDS, STATE, kind
+from hil.loop import cuda as gpu
+from hil.loop import firmware_lanes
+from hil.loop.lanes import for_each, lockstep_lanes
+from hil.loop.lockstep import CHUNK, S_N_DEM, S_N_R, S_T_OIL, WARM_UP, Run, Stimulus
+from hil.loop.tick import CHANGED_BY, FRAME, flashed, mean_stroke
+from plant import Plant, chain, chain_lanes
+from vaneloop.base.compiled import in_place, threads
+from vaneloop.base.errors import InputError
+
+__all__ = ["DEVICES", "Engines", "Unfinished", "lockstep_engines"]
+
+DEVICES = ("auto", "cpu", "cuda")
+AT_ONCE = 2 * chain_lanes.W  # engines whose logs the processor has at once, for each core's block
+MOST = 1 << 17  # engines on a GPU at once: several for each of its threads; the host builds what the next ones need
+SHARE = 0.8  # of the GPU's free memory
+DEG = 180.0 / np.pi
+
+
+@dataclass(repr=False)
+class Engines:
+    """What became of each engine; arrays with a row an engine, in the order of the plants.
+
+    servo_error  mm, largest abs(x_dem - x_lvdt)
+    angle_error  deg, largest distance of each stage's reading from the schedule's target at the measured speed; NaN:
+                 the machine lacks the stage
+    stroke, angles  mm and deg, the sensors' readings at the last sample
+    mode         number of the mode in `controller.records.MODES` at the last sample
+    in_mode      s in each mode
+    faults       fault bits that stand at the end
+    ran          whether the engine was run to the end; the figures of others are zeros
+    finite       whether every sample was a number; an engine that runs away has none of these figures
+    on           number in ``devices`` of what ran it
+    devices      names of what ran the engines
+    simulated_s  s, of each engine
+    wall_s       s on the wall clock, of all
+    notes        what was done otherwise than asked for
+    """
+
+    servo_error: np.ndarray
+    angle_error: np.ndarray
+    stroke: np.ndarray
+    angles: np.ndarray
+    mode: np.ndarray
+    in_mode: np.ndarray
+    faults: np.ndarray
+    ran: np.ndarray
+    finite: np.ndarray
+    on: np.ndarray
+    devices: list[str]
+    simulated_s: float
+    wall_s: float = 0.0
+    notes: list[str] = field(default_factory=list)
+
+
+class Unfinished(InputError):
+    """The GPU stopped half way; ``engines`` has what was finished before."""
+
+    def __init__(self, text: str, engines: Engines):
+        super().__init__(text)
+        self.engines = engines
+
+
+def lockstep_engines(
+    stimulus: Stimulus | Sequence[Stimulus],
+    plants: Sequence[Plant],
+    *,
+    calibrations: Calibration | Sequence[Calibration] | None = None,
+    seed: int | None = None,
+    every: int = 10,
+    duration: float | None = None,
+    device: str = "auto",
+    at_once: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Engines:
+    """Run a closed loop for each of the ``plants`` and return what became of each.
+
+    stimulus, calibrations, seed, every, duration  as of `hil.loop.lanes.lockstep_lanes`, whose runs these are
+    device    "cuda": the GPU; "cpu": the processor; "auto": the GPU, and the processor for what it cannot do, which
+              ``notes`` says
+    at_once   engines on the GPU at once; default: what its memory holds, `MOST` at most
+    progress  called with the number of engines that are done
+
+    Engines that do not go through lanes (`hil.loop.lanes`) run on the processor in any case. Raises InputError for
+    another device, and with "cuda" where there is no GPU that can be used; `Unfinished` where it fails half way.
+    """
+    if device not in DEVICES:
+        raise InputError(f"device (={device!r}) must be one of {', '.join(DEVICES)}")
+    if CHUNK % every:
+        raise ValueError(f"every (={every}) must divide {CHUNK}")
+    stimuli = for_each(stimulus, Stimulus, len(plants), "stimulus")
+    cals = for_each(calibrations or load_calibration(), Calibration, len(plants), "calibrations")
+    lengths = {len(s.rows) for s in stimuli}
+    if len(lengths) > 1:
+        raise ValueError(f"stimuli (={sorted(lengths)} rows) must be equally long")
+    ticks = int(round((duration if duration is not None else max(lengths, default=0) * FRAME) * 1000))
+    work = _Work(stimuli, plants, cals, seed, every, ticks)
+    out = work.out
+    started = time.perf_counter()
+
+    def done() -> None:
+        if progress is not None:
+            progress(int(out.ran.sum()))
+
+    if device != "cpu":
+        try:
+            kernel = gpu.kernel()
+            for some in work.for_gpu(kernel, at_once):
+                _on_gpu(kernel, work, some)
+                done()
+        except gpu.unusable() as e:
+            said = f"device {device!r}: {gpu.said(e)}"
+            if device == "cuda" and not out.ran.any():
+                raise InputError(said) from None
+            if device == "cuda":
+                raise Unfinished(f"{said}; {int(out.ran.sum())} of {len(plants)} engines are finished", out) from e
+            out.notes.append(f"{said}; the processor runs the engines that are left")
+    left = np.flatnonzero(~out.ran)
+    each = AT_ONCE * threads()
+    for some in (left[a : a + each] for a in range(0, len(left), each)):
+        _on_processor(work, some)
+        done()
+    out.wall_s = time.perf_counter() - started
+    return out
+
+
+class _Work:
+    """What is to be run, and what has become of it."""
+
+    def __init__(
+        self, stimuli: list[Stimulus], plants: Sequence[Plant], cals: list[Calibration], seed: int | None, every: int,
+        ticks: int,
+    ):  # fmt: skip
+        self.stimuli, self.plants, self.cals, self.seed, self.every, self.ticks = (
+            stimuli, plants, cals, seed, every, ticks
+        )  # fmt: skip
+        n, stages = len(plants), max((len(plant.vanes) for plant in plants), default=0)
+        self.out = Engines(
+            np.zeros(n), np.full((n, stages), np.nan), np.zeros(n), np.full((n, stages), np.nan), np.zeros(n, int),
+            np.zeros((n, len(MODES))), np.zeros(n, int), np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, int), [],
+            ticks * 1e-3,
+        )  # fmt: skip
+
+    def ran_on(self, device: str, some: np.ndarray) -> None:
+        """Note that engines were run to the end, and on what."""
+        if device not in self.out.devices:
+            self.out.devices.append(device)
+        self.out.on[some], self.out.ran[some] = self.out.devices.index(device), True
+
+    def for_gpu(self, kernel: gpu.Kernel, at_once: int | None) -> Iterator[np.ndarray]:
+        """Engines that can go side by side: as many stages, tables of one size, the same targets."""
+        groups: dict[Any, list[int]] = {}
+        for i, (plant, cal) in enumerate(zip(self.plants, self.cals, strict=True)):
+            if chain_lanes.way(plant.p) is not None and firmware_lanes.runs_in_lanes(cal):
+                key = (len(plant.vanes), cal.table.shape, cal.angles.shape, id(plant.schedules))
+                groups.setdefault(key, []).append(i)
+        for of in groups.values():
+            most = at_once or kernel.room(8 * (gpu.NUMBERS + 2 + len(self.plants[of[0]].vanes)), SHARE, MOST)
+            for a in range(0, len(of), most):
+                yield np.array(of[a : a + most])
+
+
+@in_place
+def _at_rest(s: np.ndarray, p: np.ndarray, strokes: np.ndarray, n_engine: np.ndarray, t_oil: np.ndarray) -> None:
+    """Put every engine to rest at its stroke (m), speed (%) and temperature (degC)."""
+    for j in range(s.shape[1]):
+        chain.rest(s, p, j, strokes[j], n_engine[j], t_oil[j])
+
+
+def _numbers(of: list[Any]) -> tuple[np.ndarray, list[Any]]:
+    """Which of the objects that differ each one is, int32, and those."""
+    known: dict[int, int] = {}
+    which = np.array([known.setdefault(id(a), len(known)) for a in of], np.int32)
+    return which, [of[int(i)] for i in np.unique(which, return_index=True)[1]]
+
+
+def _flashed(plants: list[Plant], cals: list[Calibration]) -> list[Calibration]:
+    """Each engine's calibration as it is flashed; the same object where it is the same."""
+    known: dict[Any, Calibration] = {}
+    out = []
+    for plant, cal in zip(plants, cals, strict=True):
+        key = (id(cal), *plant.p[list(CHANGED_BY), 0])
+        if key not in known:
+            known[key] = flashed(cal, plant)
+        out.append(known[key])
+    return out
+
+
+def _on_gpu(kernel: gpu.Kernel, work: _Work, some: np.ndarray) -> None:
+    """Run engines on the GPU; what they come to is written down when all of them are at the end."""
+    n, out = len(some), work.out
+    plants = [work.plants[i] for i in some]
+    stages = len(plants[0].vanes)
+    which, stimuli = _numbers([work.stimuli[i] for i in some])
+    own, cals = _numbers(_flashed(plants, [work.cals[i] for i in some]))
+    p = np.concatenate([plant.p[: gpu.P_ROWS] for plant in plants], axis=1)
+    sigma = np.zeros((2 + stages, n)) if work.seed is None else np.stack([plant.sigma for plant in plants], axis=1)
+    first = np.array([s.rows[0] for s in stimuli])[which]
+    n_r = np.where(np.isfinite(first[:, S_N_R]), first[:, S_N_R], first[:, S_N_DEM])
+    strokes = np.array([mean_stroke(cals[c].table, v) for c, v in zip(own, n_r, strict=True)])
+    s = np.zeros((chain.N_STATE, n))
+    _at_rest(s, p, strokes, first[:, S_N_DEM].copy(), first[:, S_T_OIL].copy())
+    speed, target = plants[0].schedules.arrays()
+    scalars = np.array([cal.k for cal in cals]).view(kind(SCALAR_FIELDS))[:, 0]
+    z = np.repeat(new_state()[: gpu.Z_ROWS, None], n, axis=1)
+    put = kernel.cuda.to_device
+    arrays = [
+        put(np.ascontiguousarray(a))
+        for a in (
+            sigma, own, scalars, np.array([cal.table for cal in cals]), np.array([cal.angles for cal in cals]),
+            np.vstack([speed, target.T]), s[: gpu.S_ROWS], p, z, np.zeros((gpu.FOUND, n)),
+        )
+    ]  # fmt: skip
+    del s, p
+    rows, of, silent = put(np.array([s.rows for s in stimuli])), put(which), put(np.zeros((1, 2 + stages)))
+    last = (work.ticks - 1) // work.every * work.every
+    kernel(n, -WARM_UP, WARM_UP, work.every, last, rows, of, silent, *arrays)
+    generator = np.random.Generator(np.random.PCG64(work.seed or 0))
+    for k0 in range(0, work.ticks, CHUNK):
+        ticks = min(CHUNK, work.ticks - k0)
+        noise = silent if work.seed is None else put(generator.standard_normal((ticks, 2 + stages)))
+        kernel(n, k0, ticks, work.every, last, rows, of, noise, *arrays)
+    z, found = (a.copy_to_host() for a in arrays[-2:])
+    out.servo_error[some], out.stroke[some] = 1e3 * found[gpu.SERVO], 1e3 * found[gpu.LAST_STROKE]
+    out.angle_error[some, :stages] = DEG * found[gpu.ANGLE_ERROR : gpu.ANGLE_ERROR + stages].T
+    out.angles[some, :stages] = DEG * found[gpu.ANGLE_LAST : gpu.ANGLE_LAST + stages].T
+    out.mode[some], out.faults[some] = found[gpu.LAST_MODE], z[STATE.index("faults")]
+    out.in_mode[some] = found[gpu.SAMPLES : gpu.SAMPLES + len(MODES)].T * work.every * 1e-3
+    out.finite[some] = found[gpu.LOST] == 0.0
+    work.ran_on(kernel.name, some)
+
+
+def _on_processor(work: _Work, some: np.ndarray) -> None:
+    """Run engines in lanes of the processor."""
+
+    def runs_of(those: list[int]) -> list[Run | None]:
+        try:
+            return list(
+                lockstep_lanes(
+                    [work.stimuli[i] for i in those], [work.plants[i] for i in those],
+                    calibrations=[work.cals[i] for i in those], seed=work.seed, every=work.every,
+                    duration=work.ticks * 1e-3,
+                )
+            )  # fmt: skip
+        except InputError:  # one of them runs away
+            return [None] if len(those) == 1 else [r for i in those for r in runs_of([i])]
+
+    out = work.out
+    for i, run in zip(some, runs_of(list(some)), strict=True):
+        out.finite[i] = run is not None
+        if run is None:
+            continue
+        a, plant = run.columns, work.plants[i]
+        out.servo_error[i], out.stroke[i] = np.abs(a["x_dem"] - a["x_lvdt"]).max(), a["x_lvdt"][-1]
+        targets = plant.schedules.targets(a["n_r"]) * DEG
+        for q, vane in enumerate(plant.vanes):
+            out.angle_error[i, q], out.angles[i, q] = np.abs(a[vane] - targets[:, q]).max(), a[vane][-1]
+        out.mode[i], out.faults[i] = a["state"][-1], run.faults
+        out.in_mode[i] = np.bincount(a["state"].astype(int), minlength=len(MODES)) * work.every * 1e-3
+    work.ran_on("cpu", some)
