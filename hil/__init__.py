@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hil.logs import Channel, Log, LogError, read_log, write_log
+    from hil.loop.engines import lockstep_engines
     from hil.loop.lanes import lockstep_lanes
     from hil.loop.lockstep import Run, Stimulus
     from hil.replay import ReplayResult
@@ -17,13 +18,17 @@ _HOME = {
     "LogError": "hil.logs",
     "read_log": "hil.logs",
     "write_log": "hil.logs",
+    "lockstep_engines": "hil.loop.engines",
     "lockstep_lanes": "hil.loop.lanes",
     "Run": "hil.loop.lockstep",
     "Stimulus": "hil.loop.lockstep",
     "ReplayResult": "hil.replay",
 }
 
-__all__ = ["Channel", "Log", "LogError", "ReplayResult", "Run", "Stimulus", "lockstep_lanes", "read_log", "write_log"]
+__all__ = [
+    "Channel", "Log", "LogError", "ReplayResult", "Run", "Stimulus", "lockstep_engines", "lockstep_lanes", "read_log",
+    "write_log",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -13,6 +13,7 @@ import contextlib
 import dis
 import importlib
 import math
+from collections import namedtuple
 from collections.abc import Iterator
 from functools import cache, partial
 from itertools import pairwise
@@ -27,6 +28,7 @@ from controller.firmware import tick
 from controller.records import (
     INPUT_FIELDS,
     MODES,
+    SCALAR_FIELDS,
     SLOW,
     STATE,
     STATE_FIELDS,
@@ -42,7 +44,7 @@ from hil.loop.lockstep import S_FRESH, S_MODE_REQUEST, S_N_DEM, S_N_R, S_P_S, S_
 from plant import chain, curve
 from plant.chain import SUBSTEPS, TICK, drive_step, rotor_step, sample_lvdt, vane_step
 from plant.effects import CURVES
-from plant.places import N_R, POT
+from plant.places import N_R, POT, X
 from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
 from vaneloop.base.vanes import MOST
@@ -61,6 +63,7 @@ __all__ = [
     "S_ROWS",
     "Z_ROWS",
     "Kernel",
+    "Scalars",
     "kernel",
     "said",
     "unusable",
@@ -76,11 +79,15 @@ FOUND = ANGLE_LAST + MOST
 # rows of the firmware's state that the strategies of curves have; of the plant's state and parameters, without curves
 Z_ROWS, S_ROWS, P_ROWS = STATE.index("speed"), curve.S_CURRENT + 1, CURVES + 1
 NUMBERS = Z_ROWS + S_ROWS + P_ROWS + FOUND + 1  # of an engine, beside the noise of its sensors
-THREADS = 128  # of a block
+THREADS = 256  # of a block: all that the registers of a multiprocessor of an H100 or H200 allow
 NOTHING_TO_COMPILE = "NVIDIA's compiler is missing: pip install 'numba-cuda[cu13]'"
 
 cuda: Any = None  # numba.cuda, in the kernel's own copy of these names
-_Inputs, _State = kind(INPUT_FIELDS), kind(STATE_FIELDS)
+_Inputs, _State, _number = kind(INPUT_FIELDS), kind(STATE_FIELDS), numba.float64
+
+
+Scalars = namedtuple("Scalars", [f.name for f in SCALAR_FIELDS])  # noqa: PYI024 - named as the fields are
+SCALARS_AT = 9  # of the arguments
 
 
 class _Calibration(NamedTuple):
@@ -89,6 +96,16 @@ class _Calibration(NamedTuple):
     k: Any
     table: Any
     angles: Any
+
+
+def _the_only(scalars: Any, c: int) -> Any:
+    """The scalars of the one calibration that all engines have: arguments of the kernel, in no memory."""
+    return scalars
+
+
+def _own(scalars: Any, c: int) -> Any:
+    """The scalars of an engine's own calibration."""
+    return scalars[c]
 
 
 def _mover(put: bool) -> Any:
@@ -122,17 +139,17 @@ def _zero(s: Any, p: Any, j: int, site: int) -> float:
 
 
 def _run(
-    k0: int, ticks: int, every: int, last: int, stimuli: Any, which: Any, noise: Any, sigma: Any, own: Any,
+    k0: int, ticks: int, every: int, last: int, noise: Any, stimuli: Any, which: Any, sigma: Any, own: Any,
     scalars: Any, tables: Any, angles: Any, targets: Any, s: Any, p: Any, z: Any, found: Any,
 ) -> None:  # fmt: skip
     """Advance each engine by ``ticks`` ticks from tick ``k0``, a multiple of 10: the loop of `hil.loop.lockstep`.
 
     every     ticks between two samples that count, from tick 0 on; ``last``: tick of the last one
-    stimuli, which  float64[:, frames, N_STIMULUS], and which of them each engine has
     noise     float64[ticks or 1, 2 + stages] standard normal numbers, the same for every engine
+    stimuli, which  float64[:, frames, N_STIMULUS], and which of them each engine has
     sigma     float64[2 + stages, engine], of the sensors
-    own       which calibration each engine has: records ``scalars``, float64[:, 4, points] ``tables``,
-              float64[:, 1 + stages, points] ``angles``
+    own       which calibration each engine has: ``scalars`` (records, or `Scalars` of the only one),
+              float64[:, 4, points] ``tables``, float64[:, 1 + stages, points] ``angles``
     targets   float64[1 + stages, points] speed (%) and each stage's target (rad) at it
     s, p, z   rows of the plant's state and parameters and of the firmware's state, float64[row, engine]
     found     float64[FOUND, engine]
@@ -141,49 +158,56 @@ def _run(
     if j >= s.shape[1]:
         return
     inputs_here, state_here = cuda.local.array(1, _Inputs), cuda.local.array(1, _State)
+    strokes = cuda.local.array(SLOW, _number)
     inputs, state = inputs_here[0], state_here[0]
     _take(z, j, state)
     c = own[j]
-    cal = _Calibration(scalars[c], tables[c], angles[c])
+    cal = _Calibration(_own(scalars, c), tables[c], angles[c])
     rows, stages = stimuli[which[j]], targets.shape[0] - 1
     last_frame, noisy = rows.shape[0] - 1, noise.shape[0] > 1
-    n_dem = heard = p_s = t_oil = 0.0
+    sigma_lvdt = sigma[0, j]
     inputs.pause = 0.0
-    for i in range(ticks):
-        k = k0 + i
-        m = i if noisy else 0
-        if k % SLOW == 0:
-            frame = min(max(k // SLOW, 0), last_frame)
-            n_dem, p_s, t_oil = rows[frame, S_N_DEM], rows[frame, S_P_S], rows[frame, S_T_OIL]
-            heard = rows[frame, S_N_R]
-            if heard != heard:
-                heard = s[N_R, j] + sigma[1 + stages, j] * noise[m, 1 + stages]
-            inputs.n_dem, inputs.n_r, inputs.mode_request = n_dem, heard, rows[frame, S_MODE_REQUEST]
-            inputs.demand_fresh, inputs.demand_rejected = rows[frame, S_FRESH], rows[frame, S_REJECTED]
-        else:
-            inputs.demand_fresh = 0.0
-            inputs.demand_rejected = 0.0
-        inputs.x_lvdt = sample_lvdt(s, p, j, sigma[0, j] * noise[m, 0], t_oil)
-        tick(inputs, state, cal)
-        if k >= 0 and k % every == 0:
-            error = abs(state.x_dem - inputs.x_lvdt)
-            lost = not error < np.inf
-            found[SERVO, j] = max(found[SERVO, j], error)
-            found[SAMPLES + int(state.mode), j] += 1.0
-            for q in range(stages):
-                angle = s[POT + q, j] + sigma[1 + q, j] * noise[m, 1 + q]
-                error = abs(angle - look_up(0, 1 + q, targets, heard))
-                lost = lost or not error < np.inf
-                found[ANGLE_ERROR + q, j] = max(found[ANGLE_ERROR + q, j], error)
-                if k == last:
-                    found[ANGLE_LAST + q, j] = angle
-            if lost:
-                found[LOST, j] += 1.0
-            if k == last:
-                found[LAST_MODE, j], found[LAST_STROKE, j] = state.mode, inputs.x_lvdt
-        rotor_step(s, p, j, n_dem, TICK)
-        drive_step(s, p, j, state.i_cmd, heard, p_s, t_oil, TICK, SUBSTEPS)
-        vane_step(s, p, j, heard, t_oil, (k + 1) * TICK)
+    for first in range(0, ticks, SLOW):
+        k = k0 + first
+        many = min(SLOW, ticks - first)
+        frame = min(max(k // SLOW, 0), last_frame)
+        n_dem, p_s, t_oil = rows[frame, S_N_DEM], rows[frame, S_P_S], rows[frame, S_T_OIL]
+        heard = rows[frame, S_N_R]
+        if heard != heard:
+            heard = s[N_R, j] + sigma[1 + stages, j] * noise[first if noisy else 0, 1 + stages]
+        inputs.n_dem, inputs.n_r, inputs.mode_request = n_dem, heard, rows[frame, S_MODE_REQUEST]
+        inputs.demand_fresh, inputs.demand_rejected = rows[frame, S_FRESH], rows[frame, S_REJECTED]
+        for i in range(many):
+            m = first + i if noisy else 0
+            inputs.x_lvdt = sample_lvdt(s, p, j, sigma_lvdt * noise[m, 0], t_oil)
+            tick(inputs, state, cal)
+            if k + i >= 0 and (k + i) % every == 0:
+                error = abs(state.x_dem - inputs.x_lvdt)
+                found[SERVO, j] = max(found[SERVO, j], error)
+                found[SAMPLES + int(state.mode), j] += 1.0
+                if not error < np.inf:
+                    found[LOST, j] += 1.0
+                if k + i == last:
+                    found[LAST_MODE, j], found[LAST_STROKE, j] = state.mode, inputs.x_lvdt
+            drive_step(s, p, j, state.i_cmd, heard, p_s, t_oil, TICK, SUBSTEPS)
+            strokes[i] = s[X, j]
+            inputs.demand_fresh = inputs.demand_rejected = 0.0
+        # what turns behind the piston, and the engine, push back on neither: 10 ms of theirs at a stretch find their
+        # parameters near at hand
+        for i in range(many):
+            m = first + i if noisy else 0
+            if k + i >= 0 and (k + i) % every == 0:
+                for q in range(stages):
+                    angle = s[POT + q, j] + sigma[1 + q, j] * noise[m, 1 + q]
+                    error = abs(angle - look_up(0, 1 + q, targets, heard))
+                    found[ANGLE_ERROR + q, j] = max(found[ANGLE_ERROR + q, j], error)
+                    if not error < np.inf:
+                        found[LOST, j] += 1.0
+                    if k + i == last:
+                        found[ANGLE_LAST + q, j] = angle
+            s[X, j] = strokes[i]
+            rotor_step(s, p, j, n_dem, TICK)
+            vane_step(s, p, j, heard, t_oil, (k + i + 1) * TICK)
     _put(z, j, state)
 
 
@@ -203,7 +227,7 @@ class _Copies:
         """A Python function as one of the GPU's."""
         if self._interpreted or not isinstance(function, FunctionType):
             return function
-        return self._cuda.jit(device=True, forceinline=True)(function)
+        return self._cuda.jit(device=True, forceinline=True, **_jit_options(False))(function)
 
     def of(self, value: Any, attributes: set[str]) -> Any:
         """What stands for ``value``; of a module, for those of its ``attributes`` that are used."""
@@ -238,6 +262,11 @@ class _Copies:
         return copied
 
 
+def _jit_options(simulated: bool) -> dict[str, Any]:
+    """Options of numba-cuda: no compiling at link time, which would fuse products and sums (`_unfused`)."""
+    return {} if simulated else {"lto": False}
+
+
 class Kernel:
     """`_run` on this computer's GPU."""
 
@@ -249,17 +278,17 @@ class Kernel:
         self.name = "numba's simulator" if self.simulated else here.get_current_device().name
         if isinstance(self.name, bytes):
             self.name = self.name.decode()
-        views = () if self.simulated else (as_inputs, as_outputs, as_scalars, as_state)
-        instead: dict[Any, Any] = dict.fromkeys(views, _same)
+        instead: dict[Any, Any] = dict.fromkeys((as_inputs, as_outputs, as_scalars, as_state), _same)
         instead |= dict.fromkeys((inverse_step, learn, filter_pots, curve.acts, chain._motor_step), _nothing)
         instead[curve.bend] = _zero
         if not self.simulated:
             instead[np.floor] = math.floor  # on a GPU it gives a floating-point number, of infinity too
-        copies = _Copies(here, instead, self.simulated)
         records = (_Inputs, _State) if self.simulated else map(numba.from_dtype, (_Inputs, _State))
         names = dict(zip(("_Inputs", "_State"), records, strict=True))
-        self.function = copies.copy(_run, cuda=here, _take=copies.device(_take), _put=copies.device(_put), **names)
-        self._kernel = here.jit(self.function)
+        copies = _Copies(here, instead, self.simulated)
+        moved = {"_take": copies.device(_take), "_put": copies.device(_put), "cuda": here, **names}
+        self.functions = [copies.copy(_run, **moved, _own=copies.device(f)) for f in (_the_only, _own)]
+        self._kernels = [here.jit(f, **_jit_options(self.simulated)) for f in self.functions]
 
     def room(self, each: int, share: float, most: int) -> int:
         """How many engines of so many bytes ``each`` fit into a ``share`` of the GPU's free memory, at ``most``.
@@ -275,7 +304,8 @@ class Kernel:
     def __call__(self, engines: int, *arguments: Any) -> None:
         """Run it for so many engines; arguments as of `_run`, arrays those of the GPU."""
         with _unfused(self.cuda):  # the first call compiles
-            self._kernel[-(-engines // THREADS), min(THREADS, engines)](*arguments)
+            kernel = self._kernels[not isinstance(arguments[SCALARS_AT], Scalars)]
+            kernel[-(-engines // THREADS), min(THREADS, engines)](*arguments)
 
 
 def _cuda() -> Any:

@@ -15,22 +15,25 @@ from typing import Any
 import numpy as np
 
 from controller import Calibration, load_calibration, new_state
-from controller.records import MODES, SCALAR_FIELDS, STATE, kind
+from controller.records import DUAL, MODES, SCALAR_FIELDS, STATE, kind
 from hil.loop import cuda as gpu
-from hil.loop import firmware_lanes
 from hil.loop.lanes import for_each, lockstep_lanes
 from hil.loop.lockstep import CHUNK, S_N_DEM, S_N_R, S_T_OIL, WARM_UP, Run, Stimulus
 from hil.loop.tick import CHANGED_BY, FRAME, flashed, mean_stroke
-from plant import Plant, chain, chain_lanes
+from plant import Plant, chain, places
+from plant.effects import CURVES
+from plant.parameters import KIND
 from vaneloop.base.compiled import in_place, threads
 from vaneloop.base.errors import InputError
 
-__all__ = ["DEVICES", "Engines", "Unfinished", "lockstep_engines"]
+__all__ = ["DEVICES", "Engines", "Unfinished", "lockstep_engines", "put_on_gpu"]
 
 DEVICES = ("auto", "cpu", "cuda")
-AT_ONCE = 2 * chain_lanes.W  # engines whose logs the processor has at once, for each core's block
+AT_ONCE = 128  # engines whose logs the processor has at once, for each of its cores
 MOST = 1 << 17  # engines on a GPU at once: several for each of its threads; the host builds what the next ones need
 SHARE = 0.8  # of the GPU's free memory
+# rows of p that are 0 in an engine for the GPU: the kernel has no motor, no curves and no frames of the past
+ELSEWHERE = [KIND, CURVES, places.CAN_DELAY, places.FRAME_HOLD]
 DEG = 180.0 / np.pi
 
 
@@ -98,8 +101,9 @@ def lockstep_engines(
     at_once   engines on the GPU at once; default: what its memory holds, `MOST` at most
     progress  called with the number of engines that are done
 
-    Engines that do not go through lanes (`hil.loop.lanes`) run on the processor in any case. Raises InputError for
-    another device, and with "cuda" where there is no GPU that can be used; `Unfinished` where it fails half way.
+    Engines that do not go through lanes (`hil.loop.lanes`) run on the processor in any case, one by one. Raises
+    InputError for another device, and with "cuda" where there is no GPU that can be used; `Unfinished` where it fails
+    half way.
     """
     if device not in DEVICES:
         raise InputError(f"device (={device!r}) must be one of {', '.join(DEVICES)}")
@@ -151,7 +155,7 @@ class _Work:
         self.stimuli, self.plants, self.cals, self.seed, self.every, self.ticks = (
             stimuli, plants, cals, seed, every, ticks
         )  # fmt: skip
-        n, stages = len(plants), max((len(plant.vanes) for plant in plants), default=0)
+        n, stages = len(plants), max(map(_stages, plants), default=0)
         self.out = Engines(
             np.zeros(n), np.full((n, stages), np.nan), np.zeros(n), np.full((n, stages), np.nan), np.zeros(n, int),
             np.zeros((n, len(MODES))), np.zeros(n, int), np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, int), [],
@@ -167,14 +171,21 @@ class _Work:
     def for_gpu(self, kernel: gpu.Kernel, at_once: int | None) -> Iterator[np.ndarray]:
         """Engines that can go side by side: as many stages, tables of one size, the same targets."""
         groups: dict[Any, list[int]] = {}
+        differ = {id(cal): cal for cal in self.cals}
+        curves = {i: cal.program is None and bool(cal.scalars.strategy <= DUAL) for i, cal in differ.items()}
         for i, (plant, cal) in enumerate(zip(self.plants, self.cals, strict=True)):
-            if chain_lanes.way(plant.p) is not None and firmware_lanes.runs_in_lanes(cal):
-                key = (len(plant.vanes), cal.table.shape, cal.angles.shape, id(plant.schedules))
+            if curves[id(cal)] and not any(plant.p[row, 0] for row in ELSEWHERE):
+                key = (_stages(plant), cal.table.shape, cal.angles.shape, id(plant.schedules))
                 groups.setdefault(key, []).append(i)
         for of in groups.values():
-            most = at_once or kernel.room(8 * (gpu.NUMBERS + 2 + len(self.plants[of[0]].vanes)), SHARE, MOST)
+            most = at_once or kernel.room(8 * (gpu.NUMBERS + 2 + _stages(self.plants[of[0]])), SHARE, MOST)
             for a in range(0, len(of), most):
                 yield np.array(of[a : a + most])
+
+
+def _stages(plant: Plant) -> int:
+    """How many vane stages a machine has."""
+    return len(plant.sigma) - 2
 
 
 @in_place
@@ -196,7 +207,7 @@ def _flashed(plants: list[Plant], cals: list[Calibration]) -> list[Calibration]:
     known: dict[Any, Calibration] = {}
     out = []
     for plant, cal in zip(plants, cals, strict=True):
-        key = (id(cal), *plant.p[list(CHANGED_BY), 0])
+        key = (id(cal), *(plant.p[row, 0] for row in CHANGED_BY))
         if key not in known:
             known[key] = flashed(cal, plant)
         out.append(known[key])
@@ -207,36 +218,17 @@ def _on_gpu(kernel: gpu.Kernel, work: _Work, some: np.ndarray) -> None:
     """Run engines on the GPU; what they come to is written down when all of them are at the end."""
     n, out = len(some), work.out
     plants = [work.plants[i] for i in some]
-    stages = len(plants[0].vanes)
-    which, stimuli = _numbers([work.stimuli[i] for i in some])
-    own, cals = _numbers(_flashed(plants, [work.cals[i] for i in some]))
-    p = np.concatenate([plant.p[: gpu.P_ROWS] for plant in plants], axis=1)
-    sigma = np.zeros((2 + stages, n)) if work.seed is None else np.stack([plant.sigma for plant in plants], axis=1)
-    first = np.array([s.rows[0] for s in stimuli])[which]
-    n_r = np.where(np.isfinite(first[:, S_N_R]), first[:, S_N_R], first[:, S_N_DEM])
-    strokes = np.array([mean_stroke(cals[c].table, v) for c, v in zip(own, n_r, strict=True)])
-    s = np.zeros((chain.N_STATE, n))
-    _at_rest(s, p, strokes, first[:, S_N_DEM].copy(), first[:, S_T_OIL].copy())
-    speed, target = plants[0].schedules.arrays()
-    scalars = np.array([cal.k for cal in cals]).view(kind(SCALAR_FIELDS))[:, 0]
-    z = np.repeat(new_state()[: gpu.Z_ROWS, None], n, axis=1)
-    put = kernel.cuda.to_device
-    arrays = [
-        put(np.ascontiguousarray(a))
-        for a in (
-            sigma, own, scalars, np.array([cal.table for cal in cals]), np.array([cal.angles for cal in cals]),
-            np.vstack([speed, target.T]), s[: gpu.S_ROWS], p, z, np.zeros((gpu.FOUND, n)),
-        )
-    ]  # fmt: skip
-    del s, p
-    rows, of, silent = put(np.array([s.rows for s in stimuli])), put(which), put(np.zeros((1, 2 + stages)))
+    stages = _stages(plants[0])
     last = (work.ticks - 1) // work.every * work.every
-    kernel(n, -WARM_UP, WARM_UP, work.every, last, rows, of, silent, *arrays)
+    arrays = put_on_gpu(kernel, plants, [work.cals[i] for i in some], [work.stimuli[i] for i in some], work.seed)
+    silent = kernel.cuda.to_device(np.zeros((1, 2 + stages)))
+    kernel(n, -WARM_UP, WARM_UP, work.every, last, silent, *arrays)
     generator = np.random.Generator(np.random.PCG64(work.seed or 0))
     for k0 in range(0, work.ticks, CHUNK):
-        ticks = min(CHUNK, work.ticks - k0)
-        noise = silent if work.seed is None else put(generator.standard_normal((ticks, 2 + stages)))
-        kernel(n, k0, ticks, work.every, last, rows, of, noise, *arrays)
+        ticks, noise = min(CHUNK, work.ticks - k0), silent
+        if work.seed is not None:
+            noise = kernel.cuda.to_device(generator.standard_normal((ticks, 2 + stages)))
+        kernel(n, k0, ticks, work.every, last, noise, *arrays)
     z, found = (a.copy_to_host() for a in arrays[-2:])
     out.servo_error[some], out.stroke[some] = 1e3 * found[gpu.SERVO], 1e3 * found[gpu.LAST_STROKE]
     out.angle_error[some, :stages] = DEG * found[gpu.ANGLE_ERROR : gpu.ANGLE_ERROR + stages].T
@@ -245,6 +237,36 @@ def _on_gpu(kernel: gpu.Kernel, work: _Work, some: np.ndarray) -> None:
     out.in_mode[some] = found[gpu.SAMPLES : gpu.SAMPLES + len(MODES)].T * work.every * 1e-3
     out.finite[some] = found[gpu.LOST] == 0.0
     work.ran_on(kernel.name, some)
+
+
+def put_on_gpu(
+    kernel: gpu.Kernel, plants: list[Plant], cals: list[Calibration], stimuli: list[Stimulus], seed: int | None
+) -> list[Any]:
+    """Engines at rest as arrays on the GPU: the arguments of `hil.loop.cuda.Kernel` from ``stimuli`` on."""
+    n, stages = len(plants), _stages(plants[0])
+    which, stimuli = _numbers(stimuli)
+    own, cals = _numbers(_flashed(plants, cals))
+    p = np.ascontiguousarray(np.array([plant.p[: gpu.P_ROWS, 0] for plant in plants]).T)
+    sigma = np.array([plant.sigma for plant in plants]).T if seed is not None else np.zeros((2 + stages, n))
+    first = np.array([s.rows[0] for s in stimuli])[which]
+    n_r = np.where(np.isfinite(first[:, S_N_R]), first[:, S_N_R], first[:, S_N_DEM])
+    strokes = np.array([mean_stroke(cals[c].table, v) for c, v in zip(own, n_r, strict=True)])
+    s = np.zeros((chain.N_STATE, n))
+    _at_rest(s, p, strokes, first[:, S_N_DEM].copy(), first[:, S_T_OIL].copy())
+    speed, target = plants[0].schedules.arrays()
+    scalars: Any = np.array([cal.k for cal in cals]).view(kind(SCALAR_FIELDS))[:, 0]
+    if len(cals) == 1:
+        scalars = gpu.Scalars(
+            *(tuple(v) if f.each else v for f, v in zip(SCALAR_FIELDS, scalars[0].tolist(), strict=True))
+        )
+    tables, angles = (np.array([getattr(cal, name) for cal in cals]) for name in ("table", "angles"))
+    z = np.repeat(new_state()[: gpu.Z_ROWS, None], n, axis=1)
+    arrays = (
+        np.array([s.rows for s in stimuli]), which, sigma, own, scalars, tables, angles, np.vstack([speed, target.T]),
+        s[: gpu.S_ROWS], p, z, np.zeros((gpu.FOUND, n)),
+    )  # fmt: skip
+    put = kernel.cuda.to_device
+    return [a if isinstance(a, gpu.Scalars) else put(np.ascontiguousarray(a)) for a in arrays]
 
 
 def _on_processor(work: _Work, some: np.ndarray) -> None:
