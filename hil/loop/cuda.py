@@ -16,7 +16,6 @@ import math
 from collections import namedtuple
 from collections.abc import Iterator
 from functools import cache, partial
-from itertools import pairwise
 from types import FunctionType, ModuleType
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -86,7 +85,8 @@ cuda: Any = None  # numba.cuda, in the kernel's own copy of these names
 _Inputs, _State, _number = kind(INPUT_FIELDS), kind(STATE_FIELDS), numba.float64
 
 
-Scalars = namedtuple("Scalars", [f.name for f in SCALAR_FIELDS])  # noqa: PYI024 - named as the fields are
+_named: Any = namedtuple  # mypy wants its names spelled out
+Scalars: Any = _named("Scalars", [f.name for f in SCALAR_FIELDS])
 SCALARS_AT = 9  # of the arguments
 
 
@@ -162,7 +162,7 @@ def _run(
     inputs, state = inputs_here[0], state_here[0]
     _take(z, j, state)
     c = own[j]
-    cal = _Calibration(_own(scalars, c), tables[c], angles[c])
+    cal: Any = _Calibration(_own(scalars, c), tables[c], angles[c])
     rows, stages = stimuli[which[j]], targets.shape[0] - 1
     last_frame, noisy = rows.shape[0] - 1, noise.shape[0] > 1
     sigma_lvdt = sigma[0, j]
@@ -250,11 +250,13 @@ class _Copies:
     def copy(self, python: Any, **more: Any) -> Any:
         """A Python function that calls the copies; ``more``: names that it has besides."""
         used: dict[str, set[str]] = {}
-        for before, now in pairwise([None, *dis.get_instructions(python)]):
+        of = ""  # the global name that was loaded last
+        for now in dis.get_instructions(python):
             if now.opname == "LOAD_GLOBAL":
                 used.setdefault(now.argval, set())
-            elif now.opname in ("LOAD_ATTR", "LOAD_METHOD") and before.opname == "LOAD_GLOBAL":
-                used[before.argval].add(now.argval)
+            elif of and now.opname in ("LOAD_ATTR", "LOAD_METHOD"):
+                used[of].add(now.argval)
+            of = now.argval if now.opname == "LOAD_GLOBAL" else ""
         space = {n: self.of(python.__globals__[n], used[n]) for n in used if n in python.__globals__ and n not in more}
         copied = FunctionType(python.__code__, {**space, **more}, python.__name__, python.__defaults__)
         copied.__kwdefaults__, copied.__qualname__ = python.__kwdefaults__, python.__qualname__
