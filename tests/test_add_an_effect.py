@@ -15,7 +15,7 @@ from tests.conftest import ROOT
 
 PAGE = (ROOT / "docs" / "add_an_effect.md").read_text(encoding="utf-8")
 COPIED = ("controller", "plant", "hil", "vaneloop", "tables", "tests", "examples", "docs/effects.md", "pyproject.toml")
-JUNK = shutil.ignore_patterns("__pycache__", "ahead", "vcan", "mutants")
+JUNK = shutil.ignore_patterns("__pycache__", "ahead")
 
 
 def blocks(kind: str) -> list[str]:
