@@ -99,7 +99,7 @@ def test_a_fit_is_judged_by_slopes_that_were_simulated_at_its_end() -> None:
     judge = LeastSquaresProblem(bent_stage([], 0.2), np.array([1e-3]))
     fit = judge.fit(("law",), np.array([0.3, 0.5]), 20)
     judge._near = LatestSlopes()
-    cost, gradients, normals = judge._blocks(*judge.linearise(fit.theta, fit.free))
+    cost, gradients, normals = judge.blocks(*judge.linearise(fit.theta, fit.free))
     np.testing.assert_allclose(fit.cost, cost, rtol=1e-9)
     np.testing.assert_allclose(fit.gradients, gradients, rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(fit.normals, normals, rtol=1e-9)

@@ -8,16 +8,13 @@ descent does not end before simulated slopes say so.
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Generator
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from vaneloop.identification.least_squares.broyden import NOT_KNOWN, BroydenJacobian, Known, bounded_step
-from vaneloop.identification.subsystem import Array
-
-if TYPE_CHECKING:
-    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.subsystem import Array, Stage
 
 __all__ = ["EVIDENCE", "STILL", "Begin", "End", "carries", "levenberg_marquardt"]
 
@@ -69,41 +66,81 @@ class End(NamedTuple):
     near: Known
 
 
-def carries(judge: LeastSquaresProblem, free: Array) -> bool:
+class Problem(Protocol):
+    """What a descent asks of a `identification.least_squares.problem.LeastSquaresProblem`.
+
+    stage     the subsystem; ``measured``: its outputs; ``n``: samples that count, in ``n_blocks`` blocks
+    prior     weight of each column's squared distance from its expected value; ``scale``: its usual change
+    roughly, sparing  when a fit may end early
+    """
+
+    stage: Stage
+    measured: Array
+    n: int
+    n_blocks: int
+    prior: Array
+    scale: Array
+    roughly: bool
+    sparing: bool
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest value of every column."""
+
+    def wrapped(self, theta: Array) -> Array:
+        """The same parameters, those that repeat themselves within one turn."""
+
+    def block_costs(self, e: Array) -> Array:
+        """Sum of squares per block: float64[sets, blocks]."""
+
+    def blocks(self, error: Array, jac: Array) -> Linear:
+        """Costs, gradients and normals of the blocks."""
+
+    def begun(self, theta: Array, free: Array, slopes: Known) -> tuple[Array, Callable[[Array], tuple[Array, Array]]]:
+        """Parameter sets to simulate beside slopes that are known near ``theta``, and what turns their errors into all
+        slopes.
+        """
+
+    def differences(
+        self, theta: Array, free: Array, scale: Array, high: Array, known: Array | None = None
+    ) -> tuple[Array, Callable[[Array], tuple[Array, Array]]]:
+        """Parameter sets of difference steps, and what turns their errors into the error at ``theta`` and slopes;
+        ``known``: errors at ``theta``, if they are.
+        """
+
+
+def carries(problem: Problem, free: Array) -> bool:
     """Whether slopes by these columns are carried along: a stage may not want that, and they may be too many."""
-    return judge.stage.carries and len(free) * judge.measured.size <= CARRIED
+    return problem.stage.carries and len(free) * problem.measured.size <= CARRIED
 
 
-def levenberg_marquardt(
-    judge: LeastSquaresProblem, free: Array, begin: Begin, iterations: int
-) -> Generator[Array, Array, End]:
+def levenberg_marquardt(problem: Problem, free: Array, begin: Begin, iterations: int) -> Generator[Array, Array, End]:
     """The steps of a `identification.least_squares.problem.LeastSquaresProblem.fitting` in these columns."""
-    low, high = judge.bounds()
-    theta, linear, weights = judge.wrapped(np.clip(begin.theta, low, high)), begin.linear, begin.weights
-    expected, prior, scale = judge.stage.expected(), judge._prior[free], judge.scale[free]
-    block_weights = np.ones(judge.n_blocks) if weights is None else weights
+    low, high = problem.bounds()
+    theta, linear, weights = problem.wrapped(np.clip(begin.theta, low, high)), begin.linear, begin.weights
+    expected, prior, scale = problem.stage.expected(), problem.prior[free], problem.scale[free]
+    block_weights = np.ones(problem.n_blocks) if weights is None else weights
 
     def total(cost: Array, thetas: Array) -> Array:
         return cost @ block_weights + np.sum(prior * (thetas[:, free] - expected[free]) ** 2, axis=1)
 
-    may_carry = weights is None and carries(judge, free)
+    may_carry = weights is None and carries(problem, free)
     carried = BroydenJacobian(*begin.slopes) if begin.slopes is not None and may_carry else None
     fresh = True  # whether the next step goes by slopes that are simulated
     damping, stalled, here, lately = 1e-3, False, np.inf, 0.0
     known: Array | None = None  # errors at theta
-    if linear is None and may_carry and iterations and begin.near.fits(judge.measured.size):
-        asked, all_slopes = judge._begun(theta, free, begin.near)
+    if linear is None and may_carry and iterations and begin.near.fits(problem.measured.size):
+        asked, all_slopes = problem.begun(theta, free, begin.near)
         known, slopes = all_slopes((yield asked))
         carried, fresh = BroydenJacobian(known, slopes), False
-        here = float(total(judge.block_costs(known[None]), theta[None])[0])
+        here = float(total(problem.block_costs(known[None]), theta[None])[0])
     left, carried_step = float(iterations), max(STEP, len(DAMPED) / (len(DAMPED) + max(len(free), 1)))
     first = ahead = True  # whether no step was made; whether the last was made by simulated slopes
     while left > 1e-9:
         left -= 1.0 if fresh else carried_step
         if fresh and linear is None:
-            asked, derivative = judge._differences(theta, free, scale, high, known)
+            asked, derivative = problem.differences(theta, free, scale, high, known)
             error, slopes = derivative((yield asked))
-            linear = judge._blocks(error, slopes)
+            linear = problem.blocks(error, slopes)
             carried = BroydenJacobian(error, slopes) if may_carry else None
         if linear is not None:
             here = float(total(linear[0][None], theta[None])[0])
@@ -114,12 +151,12 @@ def levenberg_marquardt(
         if len(free) == 0:
             break
         little = 0.2 * len(free)
-        if judge.roughly:
-            little *= 1.0 + max(here - judge.n, 0.0) / EVIDENCE
-        least = max(little, STILL * (here - judge.n)) if judge.sparing else little
+        if problem.roughly:
+            little *= 1.0 + max(here - problem.n, 0.0) / EVIDENCE
+        least = max(little, STILL * (here - problem.n)) if problem.sparing else little
         a, g = a + np.diag(prior * scale**2), g - prior * scale * (theta[free] - expected[free])
         limits = [(b[free] - theta[free]) / scale for b in (low, high)]
-        if (judge.roughly and not first) or (fresh and not ahead):
+        if (problem.roughly and not first) or (fresh and not ahead):
             step = bounded_step(a + 1e-9 * np.diag(np.maximum(np.diag(a), 1e-9)), g, *limits)
             if _promised(step, a, g) < (little if ahead else least):  # not even the slope promises more
                 if fresh:
@@ -135,10 +172,10 @@ def levenberg_marquardt(
                 trial = theta.copy()
                 trial[free] = np.clip(theta[free] + step * scale, low[free], high[free])
                 steps.append((trial[free] - theta[free]) / scale)
-                trials.append(judge.wrapped(trial))
+                trials.append(problem.wrapped(trial))
             thetas = np.array(trials)
             errors = yield thetas
-            costs = total(judge.block_costs(errors), thetas)
+            costs = total(problem.block_costs(errors), thetas)
             k = int(np.argmin(costs))
             # the last step is the shortest: where even it promises much and nothing came of it, the slope is not to be
             # trusted so far away

@@ -124,7 +124,7 @@ class LeastSquaresProblem:
         self._shared: dict[bytes, tuple[Array, int]] = {}  # of columns: see `_sharing`
         width = np.array([p.tolerance for p in stage.all_parameters()])
         # a tolerance is the half-width of a uniform interval; its standard deviation is a 1/sqrt(3) of it
-        self._prior = np.where(width > 0.0, 3.0 / np.where(width > 0.0, width, 1.0) ** 2, 0.0)
+        self.prior = np.where(width > 0.0, 3.0 / np.where(width > 0.0, width, 1.0) ** 2, 0.0)
         self._bounds = self._limits()
         self._turning = [c for c, p in enumerate(stage.all_parameters()) if p.period > 0.0]
         self._counted = self.valid.astype(float)
@@ -212,7 +212,7 @@ class LeastSquaresProblem:
         """What a fit minimises, of parameter sets with these whitened errors: sum of squares and prior,
         float64[sets].
         """
-        return np.asarray(self.block_costs(errors).sum(axis=1) + (thetas - self.stage.expected()) ** 2 @ self._prior)
+        return np.asarray(self.block_costs(errors).sum(axis=1) + (thetas - self.stage.expected()) ** 2 @ self.prior)
 
     def total_of(self, fit: Fit) -> float:
         """What the fit has minimised."""
@@ -270,9 +270,9 @@ class LeastSquaresProblem:
         s, free, scale, linear = self.stage, end.free, self.scale[end.free], end.linear
         low, high = self.bounds()
         if linear is None:
-            thetas, derivative = self._differences(end.theta, free, scale, high, end.errors)
+            thetas, derivative = self.differences(end.theta, free, scale, high, end.errors)
             error, rows = derivative((yield thetas))
-            linear = self._blocks(error, rows)
+            linear = self.blocks(error, rows)
             if carries(self, free):
                 self._near.put(end.theta, free, error, rows)
         fit = self._finish(effects, end.theta, free, end.prior, scale, s.expected(), low, high, *linear)
@@ -300,7 +300,7 @@ class LeastSquaresProblem:
             begin = begin._replace(linear=(start.cost, start.gradients, start.normals), slopes=at_start)
         return (yield from levenberg_marquardt(self, free, begin, iterations))
 
-    def _blocks(self, e: Array, jac: Array) -> tuple[Array, Array, Array]:
+    def blocks(self, e: Array, jac: Array) -> tuple[Array, Array, Array]:
         """Sum of squares, gradient and normal matrix of every block, from the error and its derivatives
         (`linearise`).
         """
@@ -321,14 +321,14 @@ class LeastSquaresProblem:
         """
         if (found := self._near.get(theta, free)) is not None:
             return found
-        thetas, derivative = self._differences(theta, free, self.scale[free], self.bounds()[1])
+        thetas, derivative = self.differences(theta, free, self.scale[free], self.bounds()[1])
         return derivative(self.errors(thetas))
 
     def lead(self, effects: tuple[str, ...], start: Array, iterations: int, slopes: Known = NOT_KNOWN) -> Led:
         """Where the first steps of a `fit` lead."""
         return self.together([self.leading(effects, start, iterations, slopes)])[0]
 
-    def _differences(
+    def differences(
         self, theta: Array, free: Array, scale: Array, high: Array, known: Array | None = None
     ) -> tuple[Array, Callable[[Array], tuple[Array, Array]]]:
         """Parameter sets for `linearise`, and the function from their errors to its result; ``known``: errors at theta,
@@ -358,12 +358,12 @@ class LeastSquaresProblem:
 
         return thetas if known is None else thetas[1:], derivative
 
-    def _begun(self, theta: Array, free: Array, slopes: Known) -> tuple[Array, Callable[[Array], tuple[Array, Array]]]:
+    def begun(self, theta: Array, free: Array, slopes: Known) -> tuple[Array, Callable[[Array], tuple[Array, Array]]]:
         """Parameter sets whose errors tell, beside slopes that are known near ``theta``, those that are not; and the
         function from them to the error there and all slopes.
         """
         new = free[~np.isin(free, slopes.columns)]
-        thetas, derivative = self._differences(theta, new, self.scale[new], self.bounds()[1])
+        thetas, derivative = self.differences(theta, new, self.scale[new], self.bounds()[1])
 
         def whole(e: Array) -> tuple[Array, Array]:
             here, own = derivative(e)

@@ -148,7 +148,7 @@ def followed(judge: LeastSquaresProblem, thetas: list[Array], free: Array, prior
     scale, high = judge.scale[free], judge.bounds()[1]
     errors, costs = [], []
     for i in range(0, len(thetas), TOGETHER):
-        batch = [judge._differences(theta, free, scale, high) for theta in thetas[i : i + TOGETHER]]
+        batch = [judge.differences(theta, free, scale, high) for theta in thetas[i : i + TOGETHER]]
         all_errors = judge.errors(np.concatenate([asked for asked, _ in batch]))
         at = 0
         for k, (asked, derivative) in enumerate(batch, i):

@@ -223,7 +223,7 @@ class Search:
         for k in range(DIRECTIONS):
             theta = self.base.theta.copy()
             theta[at.start + turning[0]] = p.low + p.period * k / DIRECTIONS
-            moved, derivative = judge._differences(theta, sizes, judge.scale[sizes], high, e0)
+            moved, derivative = judge.differences(theta, sizes, judge.scale[sizes], high, e0)
             thetas.append(theta)
             asked.append(moved)
             derivatives.append(derivative)

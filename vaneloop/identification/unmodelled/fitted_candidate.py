@@ -149,7 +149,7 @@ class FittedCandidate:
         """What its blocks hold at samples that count."""
         if self.rows is None:
             self.rows = self.judge.linearise(self.fit.theta, self.fit.free)
-        return self.judge._blocks(*(row * known for row in self.rows))
+        return self.judge.blocks(*(row * known for row in self.rows))
 
     def table(self) -> tuple[Callable[[Array], Array], Array]:
         """From the new curve's amplitudes to its table, and these amplitudes."""

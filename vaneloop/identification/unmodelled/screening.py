@@ -215,9 +215,9 @@ def best_step(
     """
     theta = np.concatenate([begin, np.zeros(len(effect.parameters))])
     own = np.arange(len(begin), len(theta))
-    moved, derivative = judge._differences(theta, own, judge.scale[own], judge.bounds()[1], slopes.error)
+    moved, derivative = judge.differences(theta, own, judge.scale[own], judge.bounds()[1], slopes.error)
     rows = np.concatenate([slopes.jac, derivative(judge.errors(moved))[1]])
-    _, gradients, normals = judge._blocks(slopes.error, rows)
+    _, gradients, normals = judge.blocks(slopes.error, rows)
     free = np.concatenate([fit.free, own])
     scale = judge.scale[free]
     tolerance = np.array([p.tolerance for p in effect.parameters])
