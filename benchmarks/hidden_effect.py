@@ -398,7 +398,7 @@ def _too_easy(effect: dict[str, Any]) -> bool:
 OTHER_CAUSE = {
     "play_temperature": ({"linkage_wear"}, "oil temperature"),
     "piston_cushion": ({"valve_flow_saturation"}, "a drag that grows with the square of the speed"),
-    "pot_cross_talk": ({"pot_gain", "pot_bias"}, "a share of another stage's reading"),
+    "pot_cross_talk": ({"pot_gain", "pot_bias"}, "a share of another vane row's reading"),
 }
 
 

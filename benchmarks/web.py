@@ -151,7 +151,7 @@ def web() -> Iterator[Row]:
             )
 
             page.get_by_role("button", name="Find the missing physics").click()
-            page.get_by_text("stages searched").wait_for()
+            page.get_by_text("subsystems searched").wait_for()
             answers = []
             stages = ["servo", "engine", "linkage", "actuator", "demand"]
             for k in range(20):
@@ -204,7 +204,7 @@ def two_minutes() -> Iterator[Row]:
             page.get_by_role("button", name="Find the missing physics").click()
             page.locator(".sofar").first.wait_for()
             found.append(time.perf_counter() - began)
-            page.get_by_text("The actuator stage lacks").wait_for()
+            page.get_by_text("The actuator subsystem lacks").wait_for()
             whole.append(time.perf_counter() - began)
             page.locator(".after").wait_for()
         time.sleep(20.0)  # the fits ahead

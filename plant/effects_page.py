@@ -19,8 +19,8 @@ HEAD = """# Effects
 
 Physics that the nominal machine does not have. Each is one file in `plant/effects/`, neutral by default: at its neutral
 values the machine is the nominal one, bit for bit. A model file (`plant/model.py`) switches effects on; `vaneloop
-diagnose` looks for them in a log. A parameter `vigv`, `vgv1`, ... is one of each stage that the machine has. The column
-"actuator" names the kind of actuator that an effect belongs to ([machines](machines.md)).
+diagnose` looks for them in a log. A parameter `vigv`, `vgv1`, ... is one of each vane row that the machine has. The
+column "actuator" names the kind of actuator that an effect belongs to ([machines](machines.md)).
 
 This page is made from the files: `python -m plant.effects_page > docs/effects.md`. Units are those of the borders
 (docs/architecture.md); inside the code everything is SI.

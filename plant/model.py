@@ -391,7 +391,7 @@ def _not(name: str, plant: Plant, known: Iterable[str]) -> str:
     """Why a name cannot be: of a stage that the machine lacks, or unknown."""
     vane = vane_in(name)
     if vane is not None and vane not in plant.vanes:
-        return f"of a stage that this machine lacks ({vane})"
+        return f"of a vane row that this machine lacks ({vane})"
     return f"unknown{_meant(name, known)}"
 
 

@@ -100,7 +100,7 @@ def test_stages_come_without_a_gap() -> None:
     names = ["linkage.vigv_play", "stroke", "linkage.vgv1_play", "sensors.vgv2"]
     assert vanes.own_rows(names, ("vigv", "vgv1")) == [0, 1, 2] and vanes.vane_in("stroke") is None
     vanes.same_stages(geometry=("vigv",), angles=("vigv",))
-    with pytest.raises(InputError, match=r"angles: stages \(=vigv, vgv1\) must be those of geometry, vigv$"):
+    with pytest.raises(InputError, match=r"angles: vane rows \(=vigv, vgv1\) must be those of geometry, vigv$"):
         vanes.same_stages(geometry=("vigv",), angles=("vigv", "vgv1"))
 
 

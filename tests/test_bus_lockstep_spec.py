@@ -442,7 +442,7 @@ def test_recv_lets_time_run_until_a_frame_or_its_own_end() -> None:
     task.stop()
     with pytest.raises(can.CanOperationError) as e:
         b.recv()
-    assert str(e.value) == "nothing can come: nobody on the lockstep bus has anything to send"
+    assert str(e.value) == "nothing can come: no node on the lockstep bus has anything to send"
 
 
 def test_filters_pass_over_frames_and_time_goes_on_for_the_next() -> None:

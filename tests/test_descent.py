@@ -200,7 +200,7 @@ def test_half_of_a_stage_is_done_after_sixty_fits(fits: int, share: float) -> No
     assert workflow._how_far(work, set())[0] == pytest.approx(share / 2.0)
     done, said = workflow._how_far(work, {1})
     assert done == pytest.approx(share / 2.0 + 0.5)
-    assert said == "1 of 2 stages searched" + (f"; trying p (2 effects, {fits} fits)" if fits else "")
+    assert said == "1 of 2 subsystems searched" + (f"; trying p (2 effects, {fits} fits)" if fits else "")
 
 
 def test_stages_ten_times_smaller_than_the_largest_are_searched_first() -> None:

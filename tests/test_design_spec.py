@@ -805,9 +805,9 @@ def test_a_design_on_its_limits_keeps_them(monkeypatch: pytest.MonkeyPatch) -> N
         ({"steady_error_mm": 0.0051}, "steady error on a 20 mm/s ramp"),
         ({"settled_s": 0.501}, "1 mA of null bias settled"),
         ({"quantised_codes": 3.1}, "hunting by the converter's steps"),
-        ({"lvdt": 0.051}, "hunting by play at the LVDT"),
+        ({"lvdt": 0.051}, "hunting by backlash at the LVDT"),
         ({"valve": 0.051}, "hunting by the valve's hysteresis"),
-        ({"vanes": 1.1e-4}, "hunting by play outside the loop"),
+        ({"vanes": 1.1e-4}, "hunting by backlash outside the loop"),
     ],
 )
 def test_each_limit_is_held_alone(over: dict[str, float], name: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -892,7 +892,7 @@ def test_the_summary_says_every_check_and_every_play(monkeypatch: pytest.MonkeyP
     assert "MISS hunting by the valve's hysteresis: 0.2 mm (limit 0.05)" in lines
     assert len(lines) == 2 + len(r.checks) + len(r.play)
     assert lines[-3] == (
-        "play of 0.02 mm between piston and LVDT: limit cycle predicted 0.05 mm at 1.00 Hz, with harmonics none, "
+        "backlash of 0.02 mm between piston and LVDT: limit cycle predicted 0.05 mm at 1.00 Hz, with harmonics none, "
         "simulated 0 mm at 1.00 Hz"
     )
 

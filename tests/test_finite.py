@@ -73,7 +73,9 @@ def test_what_a_model_does_not_say_is_far_off_and_what_was_not_measured_counts_n
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_stage_that_gives_no_number_as_it_was_given_is_refused_in_one_line(value: float) -> None:
-    with pytest.raises(StageError, match=r"^stage 'servo': the model's i_cmd is no number at 0.07 s and in 1 samples"):
+    with pytest.raises(
+        StageError, match=r"^subsystem 'servo': the model's i_cmd is no number at 0.07 s and in 1 samples"
+    ):
         recalibrate(LeastSquaresProblem(fake(value), np.array([0.1])))
 
 

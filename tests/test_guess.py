@@ -437,7 +437,7 @@ def test_what_is_not_used_says_why(
     assert [r.signal for r in seen.rows] == ["t", "n_dem", "x_lvdt"]
     for name, why in {
         "Fuel": "no signal of the model has such a name", "Nr": "is called n_r", "VGV_Pos": "x_lvdt has a name already",
-        "Leitschaufelwinkel": "it does not say of which stage", "HydSupply": "a unit would",
+        "Leitschaufelwinkel": "it does not say of which vane row", "HydSupply": "a unit would",
         "Fuel Pressure": "fuel is not known", "HydSupply_bar": "a supply has 8 to 40", 
         "VGV1_Soll": "no demand of a vane", "Hub_Stellung": "x_lvdt has a name already",
         "Oil Temp degC [K]": "the log says K, its name says degC", "Oil Temp": "words, not numbers",

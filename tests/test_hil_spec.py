@@ -416,7 +416,7 @@ def test_signals_are_held_against_the_log_at_its_times_and_against_the_schedule(
         assert figure.samples == 201 and np.array_equal(found.target[vane], targets[:, k])
     assert found.notes == [
         "x_lvdt: no sample while n_dem is known; not compared",
-        "vgv5: this machine has no such stage (geometry); not compared",
+        "vgv5: this machine has no such vane row (geometry); not compared",
     ]
     assert found.t == pytest.approx(loop.columns["t"]) and (found.model["n_r"] == loop.columns["n_engine"]).all()
     assert "i_motor" not in found.model and found.log == "a.csv" and found.measured.keys() == log.channels.keys()

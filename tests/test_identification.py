@@ -562,15 +562,18 @@ def test_a_floor_is_raised_to_what_an_effect_hides_between_two_rows_and_only_the
     [
         (
             lambda: replace(integrator(), measured=np.zeros((2, N))),
-            r"stage 'slide': measured has shape \(2, 10000\); \(1, 10000\) is",
+            r"subsystem 'slide': measured has shape \(2, 10000\); \(1, 10000\) is",
         ),
         (lambda: integrator(effects=(NULL_BIAS, NULL_BIAS)), "two parameters or effects share a name"),
         (lambda: integrator(effects=(replace(NULL_BIAS, starts=((1.0, 2.0),)),)), "a start has 2 values; 1 are needed"),
-        (lambda: compare_stages([replace(integrator(), floor=None)]), "stage 'slide': no noise floor"),
-        (lambda: compare_stages([replace(integrator(), floor=np.array([np.nan]))]), "stage 'slide': no noise floor"),
+        (lambda: compare_stages([replace(integrator(), floor=None)]), "subsystem 'slide': no noise floor"),
+        (
+            lambda: compare_stages([replace(integrator(), floor=np.array([np.nan]))]),
+            "subsystem 'slide': no noise floor",
+        ),
         (
             lambda: extend_stage(integrator(), ("sticky",)),
-            "stage 'slide' has no effect 'sticky'; it has null_bias, dead_band",
+            "subsystem 'slide' has no effect 'sticky'; it has null_bias, dead_band",
         ),
     ],
 )

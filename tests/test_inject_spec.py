@@ -1443,10 +1443,10 @@ def test_a_machine_with_more_stages_sends_more_and_claims_of_stages_it_lacks_are
         (Expect(signal="vgv5", low=0, by=0.1), "vgv5"),
     ):
         with pytest.raises(
-            InputError, match=f"^mine: expect {said}: this machine has the stages vigv, vgv1, vgv2, vgv3"
+            InputError, match=f"^mine: expect {said}: this machine has the vane rows vigv, vgv1, vgv2, vgv3"
         ):
             inject.run(Scenario(title="made", duration=0.4, expect=[claim]), plant=plant, name="mine")
-    with pytest.raises(InputError, match="expect VGV_ANGLES_2: this machine has the stages vigv, vgv1, vgv2$"):
+    with pytest.raises(InputError, match="expect VGV_ANGLES_2: this machine has the vane rows vigv, vgv1, vgv2$"):
         inject.run(scenario)
 
 
@@ -1497,7 +1497,7 @@ def test_what_a_machine_action_does_not_name_stays(keys: dict[str, float], suppl
 def test_an_effect_of_a_stage_that_the_machine_lacks_is_refused() -> None:
     action = inject.Machine(effect="pot_bias", parameters={"vgv7": 1.0})
     with pytest.raises(
-        InputError, match=r"^parameters\.vgv7 of pot_bias: this machine has the stages vigv, vgv1, vgv2$"
+        InputError, match=r"^parameters\.vgv7 of pot_bias: this machine has the vane rows vigv, vgv1, vgv2$"
     ):
         injection.MachineChange(action, Node(), Ecu())
 

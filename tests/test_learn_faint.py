@@ -45,7 +45,7 @@ def test_two_per_cent_of_the_noise_earn_a_curve_its_place_and_chance_does_not() 
     assert not earns(judge, chance, after, 1.0)
 
 
-@pytest.mark.parametrize(("rest", "why"), [(0.98, ""), (1.0, "rest of the log says so by 0.0 nats only")])
+@pytest.mark.parametrize(("rest", "why"), [(0.98, ""), (1.0, "rest of the log: log-likelihood gain of 0.0 only")])
 def test_samples_that_nothing_was_fitted_to_must_say_so_too(rest: float, why: str) -> None:
     before = {"log": np.ones((1, N)), "rest of the log": np.ones((1, N))}
     after = {"log": 0.97 * np.ones((1, N)), "rest of the log": rest * np.ones((1, N))}

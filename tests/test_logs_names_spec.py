@@ -192,7 +192,7 @@ def test_a_meaning_says_why(name: str, why: str) -> None:
         ("VGV_CMD", "", "a stroke or an angle: no unit says which"),
         ("VGV1_CMD", "", "the model has no demand of a vane's angle"),
         ("VGV_angle_CMD", "", "the model has no demand of a vane's angle"),
-        ("VGV", "", "it does not say of which stage"),
+        ("VGV", "", "it does not say of which vane row"),
         ("VGV 9", "", "the model has no such signal: vgv"),
         ("speed pressure", "", "it says speed and pressure"),
         ("oil", "mm", "it does not say what is measured; a unit would"),

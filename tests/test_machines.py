@@ -349,7 +349,7 @@ def test_angles_and_play_of_a_stage_belong_together(tmp_path: Path) -> None:
 def test_a_model_of_a_stage_that_the_machine_lacks_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "m.toml").write_text(text, encoding="utf-8")
     line = refused("run", "--bus", "lockstep", "--duration", "1", "--model", str(tmp_path / "m.toml"))
-    assert "is of a stage that this machine lacks (vgv3)" in line
+    assert "is of a vane row that this machine lacks (vgv3)" in line
 
 
 def test_no_more_play_can_be_taken_away_than_there_is(made: Any) -> None:

@@ -478,9 +478,9 @@ def test_a_stage_that_fails_under_one_condition_only_is_not_said_to_fail_by_what
     x = Located("engine", None, np.ones(1), (whole,), (regime,), None)  # type: ignore[arg-type]
     said = located_sentence([x])
     assert "fails most" not in said and "1.03" not in said + x.verdict()
-    assert "the engine stage fails at n_r: 1.3 %" in said and "rotor speed 70 to 80 %" in said
+    assert "the engine subsystem fails at n_r: 1.3 %" in said and "rotor speed 70 to 80 %" in said
     clean = Located("engine", None, np.ones(1), (whole,), (), None)  # type: ignore[arg-type]
-    assert located_sentence([clean]) == "Every stage fits its measurements to within the noise."
+    assert located_sentence([clean]) == "Every subsystem fits its measurements to within the noise."
 
 
 def test_a_stage_of_which_the_log_says_nothing_is_never_said_to_fit() -> None:
@@ -495,7 +495,7 @@ def test_a_stage_of_which_the_log_says_nothing_is_never_said_to_fit() -> None:
     )
     silent = {"servo": "no x_lvdt", "actuator": "no i_cmd"}
     end = "Cannot tell from this log: servo, actuator."
-    assert located_sentence([fine], silent).startswith("Every stage that the log tells of fits")
+    assert located_sentence([fine], silent).startswith("Every observed subsystem fits")
     assert all(located_sentence([x], silent).endswith(end) for x in (fine, bad))
     for verdict in ("none", "missing"):
         assert verdict_sentence(Diagnosis(verdict, [], {}, silent, 1.0)).endswith(end)
@@ -546,4 +546,7 @@ def test_a_name_at_the_beginning_of_a_sentence_stays_as_it_is_written() -> None:
 
     assert capital("x_lvdt is off") == "x_lvdt is off"
     assert capital("outflow.gain_of_oil: oil has been there") == "outflow.gain_of_oil: oil has been there"
-    assert capital("the actuator stage fails at x_lvdt.") == "The actuator stage fails at x_lvdt." and capital("") == ""
+    assert (
+        capital("the actuator subsystem fails at x_lvdt.") == "The actuator subsystem fails at x_lvdt."
+        and capital("") == ""
+    )

@@ -488,7 +488,7 @@ def test_pages_of_an_own_model_have_what_its_logs_say() -> None:
     d = replace(d, stages=d.stages[1:2], shapes={}, notes=[], not_observed={})
     answer = by_log()
     left = "force is left with an error of 0.4 N (29 % of its RMS), 1.23 times the noise of its samples"
-    lacks = "The engine stage lacks something that the library does not have"
+    lacks = "The engine subsystem lacks something that the library does not have"
     missing = diagnosis_page(d, bound, "", "a.csv", None, answer)
     assert missing.verdict == f"{lacks}; {left}."
     fits = diagnosis_page(replace(d, verdict="none"), bound, "", "a.csv", None, answer)
@@ -629,7 +629,7 @@ def test_a_healthy_fleet_and_one_without_answers() -> None:
     ] * 3 + [False]
     many = [{"engine": f"e{k}", "quantity": "q", "value": 1.0, "sisters": 2.0, "unit": "mm", "p": 0.1} for k in (1, 2)]
     assert fleet(outliers=many, series=[], lacks=[]).sentence() == (
-        "Of 3 engines 0 lack an effect in the model, 0 change over time, 2 are unlike their sisters."
+        "Of 3 engines 0 lack an effect in the model, 0 change over time, 2 are unlike their fleet peers."
     )
     effects = [fleet().lacks[0] | {"effect": f"f{k:02d}", "named": k} for k in range(26)]
     figure = fleet_page(fleet(lacks=effects)).figures[0]
@@ -867,7 +867,7 @@ def test_strategies_beside_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
     approve("strategies", outline(pages[0]))
     strategies_report("s.html", rows[:1], plant, outcomes, [], goals[:1], "dual")
     text = outline(pages[1])
-    assert "All 1 goals are held." in pages[1].verdict and pages[1].tone == "good"
+    assert "All 1 goals are met." in pages[1].verdict and pages[1].tone == "good"
     assert "fail" not in text and "with 1.00 of the travel" in pages[1].verdict
     assert text.count("“true”") == 2 and "y 600 from 0 to 0" in text  # neither growth nor wear
 

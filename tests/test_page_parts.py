@@ -632,9 +632,12 @@ def test_the_output_that_fails_most_is_told() -> None:
 
 def test_what_a_log_cannot_tell_is_said() -> None:
     assert doubt(found("x")) == ""
-    assert doubt(found("x", ["y", "z"])) == "this log cannot tell it from y or z"
+    assert doubt(found("x", ["y", "z"])) == "this log cannot distinguish it from y or z"
     both = found("x", ["y"], inseparable=["time", "oil temperature"])
-    assert doubt(both) == "this log cannot tell it from y; this log cannot tell its cause from time or oil temperature"
+    assert (
+        doubt(both)
+        == "this log cannot distinguish it from y; this log cannot distinguish its cause from time or oil temperature"
+    )
     assert untold([]) == "" and untold(["servo", "engine"]) == " Cannot tell from this log: servo, engine."
     assert jumps(None) == "" and jumps(0.0) == "" and "anew every 2.5 s" in jumps(2.5)
 
@@ -681,10 +684,9 @@ def located(stage: str, rms: float, hot: bool = False, floor: float = 1.0) -> Lo
 
 
 def test_all_stages_are_told_in_one_sentence() -> None:
-    assert located_sentence([located("servo", 1.0)]) == "Every stage fits its measurements to within the noise."
+    assert located_sentence([located("servo", 1.0)]) == "Every subsystem fits its measurements to within the noise."
     assert located_sentence([located("servo", 1.0)], ["engine"]) == (
-        "Every stage that the log tells of fits its measurements to within the noise. Cannot tell from this log: "
-        "engine."
+        "Every observed subsystem fits its measurements to within the noise. Cannot tell from this log: engine."
     )
     times = ["servo fails at 3 s", "engine fails at 9 s", "servo fails at 20 s"]
     assert located_sentence([located("servo", 1.0)], ["engine"], times) == (
@@ -696,7 +698,7 @@ def test_all_stages_are_told_in_one_sentence() -> None:
         == "Most of the log fits its measurements, but the servo fails at 3 s."
     )
     two = [located("engine", 2.5, floor=0.5), located("servo", 3.0)]
-    said = "The model fails most in the engine stage: n_r is off by 2.5 % RMS, 5.00 times its noise floor."
+    said = "The model fails most in the engine subsystem: n_r is off by 2.5 % RMS, 5.00 times its noise floor."
     assert located_sentence(two[:1], (), times) == said
     assert (
         located_sentence(two) == f"{said} servo fails too."
@@ -709,7 +711,8 @@ def test_all_stages_are_told_in_one_sentence() -> None:
     hot = [located("servo", 1.05, True), located("engine", 1.0, True)]
     where = "fails at x_lvdt: 0.15 mm (1.5 noise floors) at time 1 to 2 s"
     assert located_sentence(hot) == (
-        f"Over the whole log every stage fits its measurements, but the servo stage {where}; the engine stage {where}."
+        f"Over the whole log every subsystem fits its measurements, but "
+        f"the servo subsystem {where}; the engine subsystem {where}."
     )
     assert word_of_located(hot[0]) == "fails" and word_of_located(located("servo", 1.0)) == "fits"
     tones = [
@@ -726,7 +729,8 @@ def test_a_diagnosis_is_told_in_one_sentence() -> None:
     shape: Any = SimpleNamespace(text="the error of a oscillates")
     other: Any = SimpleNamespace(text="not the first")
     said = (
-        "The servo stage lacks dip (or leak, lag) and grip; the engine stage lacks something that the library does not"
+        "The servo subsystem lacks dip (or leak, lag) and grip; the engine subsystem lacks something that the library "
+        "does not"
     )
     said += " have"
     d = Diagnosis(
@@ -740,7 +744,7 @@ def test_a_diagnosis_is_told_in_one_sentence() -> None:
     d.shapes, d.not_observed = {}, {}
     assert verdict_sentence(d) == f"{said}."
     d.stages = [d.stages[1]]
-    assert verdict_sentence(d) == "Nothing is missing: every stage fits its measurements down to the noise floor."
+    assert verdict_sentence(d) == "Nothing is missing: every subsystem fits its measurements down to the noise floor."
 
 
 def test_short_names_keep_logs_apart() -> None:

@@ -142,7 +142,7 @@ def test_terminal_json_page_and_workbench_agree_which_stages_fail(
     web = {s: x.fails for s, x in said["web"]["located"].items()}
     expected = {s: s == "actuator" for s in ("demand", "servo", "engine", "actuator", "linkage")}
     assert terminal == on_page == in_json == on_compare == web == expected
-    sentence = "The model fails most in the actuator stage: x_lvdt is off by"
+    sentence = "The model fails most in the actuator subsystem: x_lvdt is off by"
     assert all(sentence in x for x in (drawn, said["compare page"], said["web"]["verdict"]))
     assert said["compare"]["verdict"] == "fails"
 

@@ -109,7 +109,7 @@ def test_the_json_of_diagnose_keeps_its_contract(diagnosis: tuple[Answer, Path])
 
 def test_diagnose_tells_the_user_on_standard_error_and_writes_a_page(diagnosis: tuple[Answer, Path]) -> None:
     answer, page = diagnosis
-    assert "The actuator stage lacks" in answer.err and "Traceback" not in answer.err
+    assert "The actuator subsystem lacks" in answer.err and "Traceback" not in answer.err
     text = page.read_text(encoding="utf-8")
     assert "<html" in text and "valve_dead_band" in text and "aero_load" in text
     assert 'src="http' not in text  # self-contained

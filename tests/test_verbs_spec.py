@@ -226,7 +226,9 @@ def test_pieces_of_a_long_log_are_a_minute() -> None:
     chain: Any = whole.chain((0, 1, 4, 7))
     assert chain.rows == [(0, 1200), (2400, 3000), (4200, 4500)]  # what follows one another is one; the last is short
     assert chain.whole.chosen == (0, 1, 4, 7)
-    assert chain.notes[0].startswith("a long log: 240 s of 450 are fitted, pieces of 60 s") and chain.notes[1] == "own"
+    assert (
+        chain.notes[0].startswith("a long log: 240 s of 450 are fitted, in pieces of 60 s") and chain.notes[1] == "own"
+    )
     more: Any = chain.whole.with_more([5, 1])
     assert more.rows == [(0, 1200), (2400, 3600), (4200, 4500)] and more.whole.chosen == (0, 1, 4, 5, 7)
     doubled: Any = whole.changed(lambda c: replace(c, notes=("changed",)) if isinstance(c, Stages) else c).chain((2,))
@@ -395,7 +397,7 @@ def test_a_search_goes_on_once_where_the_whole_log_fails(monkeypatch: pytest.Mon
     new = tuple(k for k in range(3, 30) if k not in (3, 9))[:10]
     assert chosen == [(3, 9), (3, 9, *new)] and chain.stages == chosen[1]
     assert told == pytest.approx([0.15, 0.4, 0.65, 0.9]) and [n.fraction for n in words] == pytest.approx(told)
-    assert words[0].text == "tries" and words[0].found == "f" and words[1].text == "held against the whole log"
+    assert words[0].text == "tries" and words[0].found == "f" and words[1].text == "checking the whole log"
     assert (
         d.stages == ["all stage"] == weighed and d.verdict == "verdict of ['all stage']" and 0.0 <= d.elapsed_s < 60.0
     )
@@ -492,10 +494,10 @@ def answer(verdict: str, laws: Sequence[Any] = (), **more: Any) -> Any:
 
 def test_an_answer_of_learn_in_words() -> None:
     assert answer("none").sentence() == "Nothing is missing: why."
-    assert answer("named").sentence() == "Laws with names say it: why."
-    assert answer("unknown").sentence() == "No honest law of one quantity or two is there: why."
+    assert answer("named").sentence() == "Laws of the library explain it: why."
+    assert answer("unknown").sentence() == "No law of one or two quantities was accepted: why."
     assert answer("unknown", steps={"x_lvdt": 0.1}).sentence() == "A reading lacks bits: why."
-    assert answer("named", steps={"x_lvdt": 0.1}).sentence() == "Laws with names say it: why."
+    assert answer("named", steps={"x_lvdt": 0.1}).sentence() == "Laws of the library explain it: why."
     two = answer("learned", [law("one"), law("two", error_before=9.0, error_after=1.25)])
     assert two.sentence().startswith("One is added; two is added. Held-out error in noise floors: 4")
     assert "1.25" in two.sentence() and "9" not in two.sentence().split("floors:")[1]
@@ -511,8 +513,8 @@ def test_an_answer_of_learn_in_words() -> None:
 def test_notes_of_learned_laws() -> None:
     laws = [law("a"), law("b", untold=(0, 1), trades=["k", "l"], rivals=["c", "d"]), law("c", untold=(1,))]
     assert answer("learned", laws).notes == [
-        "note", "a: range", "b: its mean and slope cannot be told from these logs; it trades with k, l",
-        "b: as good: c, d", "b: range", "c: its slope cannot be told from these logs", "c: range",
+        "note", "a: range", "b: its mean and slope cannot be estimated from these logs; it trades with k, l",
+        "b: as good: c, d", "b: range", "c: its slope cannot be estimated from these logs", "c: range",
     ]  # fmt: skip
 
 
@@ -654,7 +656,9 @@ def test_laws_of_all_stages_are_one_answer(monkeypatch: pytest.MonkeyPatch) -> N
     said = at.learned(shape=["odd"], formulas=False)
     assert said.verdict == "learned" and [x.name for x in said.laws] == ["one", "two", "three"]
     assert said.laws[0].before == ("judge", "base") and said.laws[1].before == ("judge of one", "fit of one")
-    assert said.outcome.notes == ["a: hm", "b: two: another stage says it, too"] and said.steps == {"x_lvdt": 0.1}
+    assert said.outcome.notes == ["a: hm", "b: two: another subsystem has the same law"] and said.steps == {
+        "x_lvdt": 0.1
+    }
     assert said.model.meta["history"] == [
         "2 laws", "stage of judge of two", "1 laws", "stage of judge of three", "fits of 1",
     ]  # fmt: skip
@@ -1196,13 +1200,13 @@ def test_effects_are_fitted_in_the_first_stage_that_shows_them(monkeypatch: pyte
 def test_what_the_log_does_not_show_cannot_be_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
     chain, _ = extending(monkeypatch)
     with pytest.raises(
-        InputError, match=r"a.csv: --effect rotor_lag_error: the log does not show its stage .engine: no n_r"
+        InputError, match=r"a.csv: --effect rotor_lag_error: the log does not show its subsystem .engine: no n_r"
     ):
         search.extended(chain, ["rotor_lag_error"], Model(), "a.csv")
     with pytest.raises(InputError, match="--effect gear_backlash: not of an actuator of kind hydraulic"):
         search.extended(chain, ["gear_backlash"], Model(), "a.csv")
     curve = CURVE.model_copy(update={"at": "engine.demand"})
-    with pytest.raises(InputError, match=r"--effect bend: the log does not show its stage .engine: no n_r"):
+    with pytest.raises(InputError, match=r"--effect bend: the log does not show its subsystem .engine: no n_r"):
         search.extended(chain, ["bend"], Model(curves={"bend": curve}), "a.csv")
     chain.not_observed = {}
     with pytest.raises(InputError, match=r"--effect rotor_lag_error: .*engine: not observed"):

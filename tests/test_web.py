@@ -286,7 +286,7 @@ def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page:
     page.get_by_role("button", name="Cancel").wait_for()
     for pid in during:
         os.kill(pid, signal.SIGCONT)
-    page.get_by_text("The actuator stage lacks valve_dead_band and aero_load").wait_for()
+    page.get_by_text("The actuator subsystem lacks valve_dead_band and aero_load").wait_for()
     wait_ratio(page, "< 1.1")
     found = page.locator('[data-effect="valve_dead_band"] .about').inner_text()
     assert (m := re.search(r"half_width ([\d.]+)", found)) and 0.75 < float(m[1]) < 0.85, found
@@ -424,9 +424,9 @@ def test_a_page_that_fails_inside_says_so_in_a_plain_line(browser: Any, tmp_path
         page.get_by_text("fails most in the actuator stage").wait_for()  # the other parts go on
         page.get_by_role("button", name="Find the missing physics").click()
         page.get_by_text(re.compile("so far: .* fits")).first.wait_for()  # stages as they finish
-        page.get_by_text("stages searched").wait_for()
+        page.get_by_text("subsystems searched").wait_for()
         (tmp_path / "answered").touch()
-        page.get_by_text("The actuator stage lacks valve_dead_band and aero_load").wait_for()
+        page.get_by_text("The actuator subsystem lacks valve_dead_band and aero_load").wait_for()
         page.get_by_text("so far:").first.wait_for(state="detached")  # the answer says it
         page.context.close()
     finally:
@@ -774,7 +774,7 @@ def test_schedule_from_lengths_to_tables_for_the_controller(server: Server, page
     step(page, "Stroke for the VIGV")
     page.reload()  # a reload in the middle keeps what was done
     page.get_by_role("heading", name="Step 2: Stroke for the VIGV").wait_for()
-    step(page, "Links of the other stages")
+    step(page, "Links of the other vane rows")
     step(page, "Measured loop")
     step(page, "Tables")
     with page.expect_download() as download:
@@ -854,7 +854,7 @@ def test_a_fleet_s_run_is_followed_and_leads_to_its_logs(server: Server, page: A
     page.get_by_text("180 of 180 logs done").wait_for()  # by itself
     view = view_of(roll_up(folder), {})
     page.get_by_text(view.sentence()).wait_for()
-    for title in ("Engines and effects", "What changes", "Unlike their sisters", "What the logs could not show"):
+    for title in ("Engines and effects", "What changes", "Unlike their fleet peers", "What the logs could not show"):
         page.get_by_role("heading", name=title).wait_for()
     page.wait_for_function(f"document.querySelectorAll('.main-svg').length >= {len(view.changed) + 1}")
     looks(page, "fleet")

@@ -230,7 +230,7 @@ class LockstepBus(can.BusABC):
             if end is not None and now >= end:
                 return None
             if end is None and channel.idle():
-                raise can.CanOperationError("nothing can come: nobody on the lockstep bus has anything to send")
+                raise can.CanOperationError("nothing can come: no node on the lockstep bus has anything to send")
             channel.advance_to(now + BIT_RATE if end is None else end, self.place)
 
     def read_rows(self, rows: np.ndarray) -> int:

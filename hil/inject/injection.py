@@ -101,7 +101,7 @@ class MachineChange:
             for name, value in action.parameters.items():
                 if name not in own:
                     stages = ", ".join(node.plant.vanes)
-                    raise InputError(f"parameters.{name} of {action.effect}: this machine has the stages {stages}")
+                    raise InputError(f"parameters.{name} of {action.effect}: this machine has the vane rows {stages}")
                 row, si = own[name]
                 self.new[row] = value * si
         self.supply = {i: v for i, v in ((0, action.p_s), (1, action.t_oil)) if v is not None}
@@ -182,7 +182,7 @@ def _check_stages(name: str, scenario: Scenario, plant: Plant) -> None:
         stage = claim.signal in VANES and claim.signal not in plant.vanes
         if stage or (claim.late is not None and not _sent_by(claim.late, plant)):
             raise InputError(
-                f"{name}: expect {claim.signal or claim.late}: this machine has the stages {', '.join(plant.vanes)}"
+                f"{name}: expect {claim.signal or claim.late}: this machine has the vane rows {', '.join(plant.vanes)}"
             )
 
 

@@ -444,7 +444,7 @@ def lacks(name: str, unit: str = "") -> str:
             "the model has no demand of a vane's angle"
         )  # fmt: skip
     if quantity == "vgv" and not numbers:
-        return "it does not say of which stage"
+        return "it does not say of which vane row"
     if not quantity:
         several = [q for q in dict.fromkeys(kinds) if q in _QUANTITIES]
         return (

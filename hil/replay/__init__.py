@@ -122,7 +122,7 @@ def replay(
     signals = []
     for name, stage in STAGE.items():
         if name in log.channels and name not in model:
-            notes.append(f"{name}: this machine has no such stage (geometry); not compared")
+            notes.append(f"{name}: this machine has no such vane row (geometry); not compared")
         elif name in log.channels:
             c = log.channels[name]
             if name in COMMANDS and c.framed:  # the plant's engine gets a demand when the controller has it

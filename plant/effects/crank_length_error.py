@@ -6,7 +6,7 @@ Equation::
 
 Symbols: Lb lower arm (m), error (m); the linkage's equations (plant/linkage.py) do the rest.
 Limits: geometry only; where the linkage cannot be assembled it is held at the nearest stretched position.
-In a log: the stage's angle is off in proportion to the distance from the stroke at which the lower arm is square to
+In a log: the vane row's angle is off in proportion to the distance from the stroke at which the lower arm is square to
 its link: slope, hardly offset.
 Source: Kim & Ki 2020, equations (8) to (15), section 5 (arms adjusted by 1 and 3 mm).
 """

@@ -5,8 +5,8 @@ Equation::
     d <- min(max(d + du, -w/2), w/2),   the rod moves by what is left of du      (play operator)
 
 Symbols: d motor ahead of the rod (m), du way of the motor in the step, seen at the rod (m), w width (m).
-Limits: the vanes' friction holds the rod while the motor crosses the play; no blow at its end, and the rod's load does
-not press it to one side.
+Limits: the vanes' friction holds the rod while the motor crosses the backlash; no blow at its end, and the rod's load
+does not press it to one side.
 In a log: at each reversal x_lvdt stands until the motor has crossed the width, at the speed that i_cmd asks for; the
 loss is the same at each. In closed loop a small limit cycle from some 0.05 mm on.
 Source: play operator, see plant/play.py; Nordin and Gutman, Automatica 38 (2002), controlling systems with backlash.
@@ -23,9 +23,9 @@ EFFECT = Effect(
     "gear_backlash",
     "screw",
     ("actuator",),
-    (Parameter("width", "mm", 0.0, 0.0, 2.0, "total play between motor and rod, at the rod"),),
+    (Parameter("width", "mm", 0.0, 0.0, 2.0, "total backlash between motor and rod, at the rod"),),
     ("ahead",),
-    "play between motor and rod",
+    "backlash between motor and rod",
     "reversals of the stroke",
     MOTOR,
 )

@@ -6,7 +6,7 @@ Equation::
 
 Symbols: Lc vertical link (m), error (m); the linkage's equations (plant/linkage.py) do the rest.
 Limits: geometry only; where the linkage cannot be assembled it is held at the nearest stretched position.
-In a log: the stage's angle is off by about -1.6 deg for 1 mm, nearly the same at every stroke: an offset, like a
+In a log: the vane row's angle is off by about -1.6 deg for 1 mm, nearly the same at every stroke: an offset, like a
 potentiometer's bias but for a slight dependence on the angle.
 Source: Kim & Ki 2020, section 5: 1 mm of link is 1.6 deg.
 """

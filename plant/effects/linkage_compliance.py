@@ -4,10 +4,10 @@ Equation::
 
     th <- th - compliance (n_r / 100 %)^2
 
-Symbols: th ring angle before the play (rad), compliance ring angle lost at the load of 100 % (rad), n_r rotor speed
+Symbols: th ring angle before the backlash (rad), compliance ring angle lost at the load of 100 % (rad), n_r rotor speed
 (%). The same for all rings.
 Limits: load as dynamic pressure only, whatever the vane angle; elastic, without delay.
-In a log: vane angles fall short as n_r squared, all stages (by Ld'/L of the lever), both directions alike;
+In a log: vane angles fall short as n_r squared, all vane rows (by Ld'/L of the lever), both directions alike;
 nothing at low speed.
 Source: Hooke's law; dynamic pressure.
 """

@@ -4,11 +4,11 @@ Equation, with a the ring's travel over distance and y in [-1, 1] the bristle::
 
     y <- s + (y - s) exp(-|a|),   s = sign(a),   th_vane side = th - (width/2) (L / Ld') y
 
-Symbols: th ring angle behind the play (rad), width total at the vane (rad), L / Ld' ratio of the lever at mid-stroke,
-distance ring travel over which the loop closes to 1/e (rad). Rate-independent: only travel counts.
+Symbols: th ring angle behind the backlash (rad), width total at the vane (rad), L / Ld' ratio of the lever at
+mid-stroke, distance ring travel over which the loop closes to 1/e (rad). Rate-independent: only travel counts.
 Limits: Dahl's first-order curve; minor loops drift a little under small vibration, which Coulomb joints do not.
-In a log: as play, the up and down strokes differ by the width, but the vane starts to move at once after a reversal
-and closes the gap exponentially with travel.
+In a log: as with backlash, the up and down strokes differ by the width, but the vane starts to move at once after a
+reversal and closes the gap exponentially with travel.
 Source: Dahl, AIAA J. 14 (1976) 1675.
 """
 
@@ -31,7 +31,7 @@ EFFECT = Effect(
         Parameter("distance", "deg", 0.2, 0.01, 5.0, "ring travel over which the loop closes to 1/e"),
     ),
     (*(f"bristle_{v}" for v in VANES), *(f"ring_{v}" for v in VANES)),
-    "a smooth hysteresis loop beside the play",
+    "a smooth hysteresis loop beside the backlash",
     "reversals of the stroke, slow enough to see the vane start",
 )
 

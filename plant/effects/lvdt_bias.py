@@ -7,7 +7,7 @@ Equation::
 Symbols: x stroke (m), bias (m).
 Limits: constant.
 In a log: the servo hides it, x_lvdt follows x_dem; the vanes stand off by bias times their slope (about 1 deg/mm),
-all stages at once and in the ratio of their slopes. At an end stop x_lvdt reads the bias.
+all vane rows at once and in the ratio of their slopes. At an end stop x_lvdt reads the bias.
 Source: definition.
 """
 

@@ -6,7 +6,7 @@ Equation::
 
 Symbols: x stroke from full retraction (m), factor (-).
 Limits: linear; the gain's centre is taken at stroke 0, another centre adds a bias.
-In a log: vanes off in proportion to stroke, all stages at once; the actuator looks faster by the factor for the
+In a log: vanes off in proportion to stroke, all vane rows at once; the actuator looks faster by the factor for the
 same current.
 Source: definition.
 """

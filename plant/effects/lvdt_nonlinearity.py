@@ -8,7 +8,7 @@ Symbols: x stroke (m), amplitude (m), cubic (m), stroke full stroke (m). The sin
 The cubic is what coils that weaken towards their ends give, with its straight part, which is a gain, taken out.
 Limits: two odd shapes about mid-stroke; an even one moves the null and is left out. Beyond the stroke the cubic stays
 what it is at its end.
-In a log: vanes off one way in one half of the stroke and the other way in the other half, all stages at once;
+In a log: vanes off one way in one half of the stroke and the other way in the other half, all vane rows at once;
 independent of direction and speed.
 Source: 0.25 % of range is a usual data-sheet linearity of an LVDT; Herceg, Handbook of Measurement and Control (1976).
 """

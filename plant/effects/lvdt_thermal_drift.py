@@ -6,7 +6,7 @@ Equation::
 
 Symbols: x stroke (m), T oil temperature (degC), coefficient (m/K).
 Limits: linear, and the sensor is as warm as the oil: no thermal lag.
-In a log: vanes drift with t_oil, all stages at once in the ratio of their slopes, while x_lvdt follows x_dem.
+In a log: vanes drift with t_oil, all vane rows at once in the ratio of their slopes, while x_lvdt follows x_dem.
 Source: definition; 0.01 % of range per kelvin is a usual data-sheet figure.
 """
 

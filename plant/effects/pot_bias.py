@@ -6,7 +6,7 @@ Equation::
 
 Symbols: vane angle (rad), bias (rad).
 Limits: constant. Within the rigging tolerance of 0.1 deg it is a recalibration of sensors.*_bias, not an effect.
-In a log: one stage stands off by the same angle at every stroke, speed, direction; the others do not.
+In a log: one vane row is off by the same angle at every stroke, speed, direction; the others do not.
 Source: definition.
 """
 

@@ -6,7 +6,7 @@ Equation::
 
 Symbols: vane angle (rad), factor (-). The bias is added after it.
 Limits: linear about vane angle 0.
-In a log: one stage's error grows in proportion to its angle, and its hysteresis is wider by the factor too.
+In a log: one vane row's error grows in proportion to its angle, and its hysteresis is wider by the factor too.
 Source: definition.
 """
 

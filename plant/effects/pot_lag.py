@@ -6,8 +6,8 @@ Equation::
 
 Symbols: vane angle (rad), y reading (rad), tau nominal lag (s), lag beyond it (s).
 Limits: first order.
-In a log: one stage's reading trails while the vanes move, in proportion to their speed, with the same sign as the
-motion; dwells are right. A play also trails, but by an angle that does not depend on speed.
+In a log: one vane row's reading trails while the vanes move, in proportion to their speed, with the same sign as the
+motion; dwells are right. Backlash also makes it trail, but by an angle that does not depend on speed.
 Source: first-order lag, Ogata, Modern Control Engineering (2010), section 5.
 """
 

@@ -4,12 +4,12 @@ Equation::
 
     th <- th + amplitude sin(th + phase)
 
-Symbols: th ring angle before the play (rad), amplitude (rad), phase direction of the eccentricity (rad), the same for
-the rings.
+Symbols: th ring angle before the backlash (rad), amplitude (rad), phase direction of the eccentricity (rad), the same
+for the rings.
 Limits: first harmonic; the ring turns by some 10 deg only, of which an offset, a slope and a slight curvature are
 seen.
-In a log: offset and slope of one stage's angle over stroke, both directions alike. Hard to tell from pot_bias and
-pot_gain on a short stroke.
+In a log: offset and slope of one vane row's angle over stroke, both directions alike. Hard to distinguish from
+pot_bias and pot_gain on a short stroke.
 Source: eccentric sheave, Shigley, Theory of Machines and Mechanisms.
 """
 

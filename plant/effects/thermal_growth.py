@@ -4,10 +4,10 @@ Equation::
 
     th <- th + coefficient L / Ld' (T - 40 degC)
 
-Symbols: th ring angle before the play (rad), coefficient at the vane (rad/K), L / Ld' ratio of the lever at
+Symbols: th ring angle before the backlash (rad), coefficient at the vane (rad/K), L / Ld' ratio of the lever at
 mid-stroke, T oil temperature (degC).
 Limits: linear and without thermal lag; the oil stands for the casing.
-In a log: one stage drifts with t_oil while the others do not (an LVDT that drifts moves all).
+In a log: one vane row drifts with t_oil while the others do not (an LVDT that drifts moves all).
 Source: linear expansion; 0.5 mm/m for 40 K of steel.
 """
 
@@ -24,7 +24,7 @@ EFFECT = Effect(
     ("linkage",),
     per_vane_stage("deg/K", 0.0, -0.5, 0.5, "vane angle per kelvin of oil above 40 degC"),
     (),
-    "a stage's angle drifts with temperature",
+    "the angle of a vane row drifts with temperature",
     "oil that warms up by 10 K or more",
 )
 

@@ -1,12 +1,13 @@
 """Magnetic memory of the torque motor: rising and falling current open the valve differently.
 
-Equation, plays in parallel, with i the command and y the current that counts::
+Equation, play operators in parallel, with i the command and y the current that counts::
 
     y_k <- min(max(y_k, i - w_k / 2), i + w_k / 2),   w_k = width (1 + spread (-3/4, -1/4, 1/4, 3/4)),   y = mean of y_k
 
-Symbols: i, y (A), width total (A), of a loop over the whole range; spread (-) of the plays' widths. At spread 1, equal
-shares of plays from 0 to 2 width are Rayleigh's law of magnetisation: a small reversal shows little of the width and
-its loop is round. At spread 0 all are one plain play: friction in the torque motor, a loose feedback spring.
+Symbols: i, y (A), width total (A), of a loop over the whole range; spread (-) of the operators' widths. At spread 1,
+equal shares of operators from 0 to 2 width are Rayleigh's law of magnetisation: a small reversal shows little of the
+width and its loop is round. At spread 0 all are one plain backlash: friction in the torque motor, a loose feedback
+spring.
 Limits: rate-independent; the same at every current (no saturation of the iron). Dither, which shrinks it in practice,
 counts as a smaller width. On a log of mean currents the turns between two samples are not seen.
 In a log: after a reversal of i_cmd the stroke's speed follows the current only in part until it has come back by
@@ -29,10 +30,10 @@ EFFECT = Effect(
     ("actuator",),
     (
         Parameter("width", "mA", 0.0, 0.0, 20.0, "total width between rising and falling current"),
-        Parameter("spread", "-", 1.0, 0.0, 1.0, "1: magnetic, round loops; 0: one play, with corners"),
+        Parameter("spread", "-", 1.0, 0.0, 1.0, "1: magnetic, round loops; 0: one backlash, with corners"),
     ),
     ("current_1", "current_2", "current_3", "current_4"),
-    "the valve remembers where its current came from",
+    "the valve opens differently on rising and falling current",
     "reversals of the current",
     HYDRAULIC,
 )

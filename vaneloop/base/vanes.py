@@ -24,7 +24,7 @@ def vanes_of(present: Collection[str]) -> tuple[str, ...]:
     lacking = next((v for v in VANES[: len(own) or 1] if v not in own), None)
     if lacking is not None:
         why = f", but {own[-1]} is there" if own else ""
-        raise ValueError(f"{lacking} is missing{why}: the stages are vigv, vgv1, ... up to {VANES[-1]}, without a gap")
+        raise ValueError(f"{lacking} is missing{why}: the rows are vigv, vgv1, ... up to {VANES[-1]}, without a gap")
     return own
 
 
@@ -33,7 +33,7 @@ def same_stages(**tables: Collection[str]) -> None:
     (first, stages), *others = tables.items()
     for name, of in others:
         if tuple(of) != tuple(stages):
-            raise InputError(f"{name}: stages (={', '.join(of)}) must be those of {first}, {', '.join(stages)}")
+            raise InputError(f"{name}: vane rows (={', '.join(of)}) must be those of {first}, {', '.join(stages)}")
 
 
 def vane_in(name: str) -> str | None:

@@ -41,7 +41,7 @@ def add_service_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--uds", action="store_true", help="answer service tools: UDS on ISO-TP (docs/uds.md)")
     group.add_argument("--uds-memory", metavar="F.json", help="file that keeps the trouble codes over a restart")
     group.add_argument(
-        "--tool-seed", metavar="N", type=int, help="seeds of the locks follow from N (default: nobody can foresee them)"
+        "--tool-seed", metavar="N", type=int, help="seeds of the locks follow from N (default: unpredictable)"
     )
 
 

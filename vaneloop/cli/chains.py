@@ -19,7 +19,7 @@ __all__ = ["chain_of", "tell_search"]
 def tell_search(say: Callable[[str], None]) -> None:
     """Tell the user that the first search compiles; silent when the compiled code is there already."""
     if not (is_cached(hydraulic_blocks.run) or is_cached(motor_blocks.run)):
-        say("compiling the stages of the search for this machine (once, about 30 s) ...")
+        say("compiling the subsystems of the search for this machine (once, about 30 s) ...")
 
 
 def chain_of(args: argparse.Namespace, model: Any = None, loop: bool = False) -> Any:

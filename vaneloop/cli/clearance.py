@@ -17,8 +17,8 @@ __all__ = ["DESCRIPTION", "add_options", "command"]
 
 DESCRIPTION = """Where hysteresis comes from: clearance in the joints and a ring whose centre can wander, in the
 mechanism closed in space. Each joint rests on the side that carries the load; the vanes resist motion, so all of them
-change sides at a reversal. Given the fits of the pins, the command finds the ring's freedom that explains each stage's
-nominal width, and shows what each joint adds.
+change sides at a reversal. Given the fits of the pins, the command finds the ring's freedom that explains each vane
+row's nominal width, and shows what each joint adds.
 
 examples:
   vaneloop clearance --report clearance.html

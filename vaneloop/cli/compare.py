@@ -15,11 +15,11 @@ from vaneloop.verbs.search import compared
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Compare the model with a log: the whole loop, as replay does, and each stage driven by its own logged
-inputs.
+DESCRIPTION = """Compare the model with a log: the whole loop, as replay does, and each subsystem driven by its own
+logged inputs.
 
-In closed loop the controller hides what the model lacks; stage by stage it cannot. Errors are in the signal's unit and
-in multiples of the noise floor.
+In closed loop the controller hides what the model lacks; in a subsystem alone it cannot. Errors are in the signal's
+unit and in multiples of the noise floor.
 
 examples:
   vaneloop compare examples/hidden_effect.parquet
@@ -65,10 +65,10 @@ def command(args: argparse.Namespace) -> int:
         rows += [
             [name, f"{story.CANNOT}: {why}", "-", "-", "-", "-", "", "-"] for name, why in chain.not_observed.items()
         ]
-        columns = ["stage", "signal", "rms", "noise floor", "ratio", "as given", "unit", "samples"]
+        columns = ["subsystem", "signal", "rms", "noise floor", "ratio", "as given", "unit", "samples"]
         terminal.print_table(
             args,
-            "each stage on its own logged inputs, nominal parameters refitted within their tolerances",
+            "each subsystem on its own logged inputs, nominal parameters refitted within their tolerances",
             columns,
             rows,
         )
@@ -84,7 +84,7 @@ def command(args: argparse.Namespace) -> int:
     args.report = report
     code = replay.replayed(args, {"stages": stages, **extra}, floors, said)
     if alone:  # where the loop cannot be compared either, that is said once
-        terminal.say(args, f"note: no stage by stage comparison: {alone}")
+        terminal.say(args, f"note: no comparison by subsystem: {alone}")
     return code
 
 

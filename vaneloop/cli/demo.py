@@ -47,7 +47,7 @@ def _step(text: str, *argv: str, allowed: tuple[int, ...] = (0,)) -> None:
 def _simulate(example: str) -> None:
     """Runs through firmware and plant."""
     _step(
-        "A recorded engine run (CAN log, from an independent rig) through firmware and plant",
+        "A recorded engine run (CAN log, from an independent simulator) through firmware and plant",
         "replay", example, "--report", str(OUT / "engine_run.html"),
     )  # fmt: skip
     data = _shared_data()
@@ -67,7 +67,7 @@ def _simulate(example: str) -> None:
 def _search(hidden: str) -> None:
     """From a log that does not fit to the model that does."""
     model = str(OUT / "extended.toml")
-    _step("Another log does not fit: by how much, stage by stage?", "compare", hidden, allowed=(0, 1))
+    _step("Another log does not fit: by how much, in each subsystem?", "compare", hidden, allowed=(0, 1))
     _step("Where does it fail?", "locate", hidden, allowed=(0, 1))
     page, answer = str(OUT / "diagnosis.html"), str(OUT / "diagnosis.json")
     _step("What is missing?", "diagnose", hidden, "--report", page, "--json", answer, allowed=(0, 1))

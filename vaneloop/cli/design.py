@@ -11,8 +11,8 @@ from vaneloop.cli.options import add_plant_option
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
 DESCRIPTION = """Servo loop: crossover, gain, phase and disk margins at every corner of the tolerances, step and ramp,
-and the limit cycles that play inside the loop would cause, predicted by describing function and held against the time
-simulation.
+and the limit cycles that backlash inside the loop would cause, predicted by describing function and compared with the
+time simulation.
 
 examples:
   vaneloop design --report design.html
@@ -27,7 +27,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ki", type=float, metavar="G", help="integral gain, mA/(mm s)")
     parser.add_argument("--kff", type=float, metavar="G", help="feed-forward of the demanded speed, mA/(mm/s)")
     parser.add_argument(
-        "--backlash-inside", type=float, metavar="MM", help="play between piston and LVDT to examine, mm"
+        "--backlash-inside", type=float, metavar="MM", help="backlash between piston and LVDT to examine, mm"
     )
     add_plant_option(parser)
     terminal.add_output_options(parser, report=True)

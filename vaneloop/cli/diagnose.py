@@ -18,10 +18,10 @@ __all__ = ["DESCRIPTION", "add_options", "command", "show"]
 
 DESCRIPTION = """Find the physical effects that the model lacks, from a log.
 
-Every stage of the machine (demand, servo, engine, actuator, linkage) is driven by its own logged inputs. Each effect of
-the library is fitted, the leaders in pairs; what earns its place on data that it was not fitted to is named, with its
-probability, its parameters and the rivals that this log cannot tell apart. Where the library does not suffice the
-answer is "unknown", with the shape of what is left.
+Every subsystem of the machine (demand, servo, engine, actuator, linkage) is driven by its own logged inputs. Each
+effect of the library is fitted, the leaders in pairs. An effect that improves the fit to held-out data is accepted. It
+is reported with its probability, its parameters and the rivals that this log cannot distinguish from it. Where the
+library does not suffice the answer is "unknown", with the shape of the remaining error.
 
 examples:
   vaneloop diagnose examples/hidden_effect.parquet --report diagnosis.html
@@ -35,7 +35,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_log_options(parser)
     add_machine_options(parser)
     options.add_controller_options(parser)
-    parser.add_argument("--workers", type=int, default=2, metavar="N", help="stages searched side by side (default 2)")
+    parser.add_argument(
+        "--workers", type=int, default=2, metavar="N", help="subsystems searched in parallel (default 2)"
+    )
     options.add_without_option(parser)
     own_model.add_options(parser)
     terminal.add_output_options(parser, report=True)
@@ -71,7 +73,7 @@ def show(args: argparse.Namespace, answer: Any) -> None:
             rows.append([s.stage, word(s), s.outputs[k], *figures, s.units[k]])
     for name, why in d.not_observed.items():
         rows.append([name, CANNOT, why, "-", "-", "-", ""])
-    columns = ["stage", "verdict", "signal", "error before", "error after", "noise floor", "unit"]
+    columns = ["subsystem", "verdict", "signal", "error before", "error after", "noise floor", "unit"]
     if answer.by_log is not None:
         own_model.show(args, answer.by_log)
     else:

@@ -16,8 +16,8 @@ from vaneloop.verbs.search import experiment as recommend
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Recommend the next experiment: the log is diagnosed; every pair of effects that it cannot tell apart is
-simulated with its fitted parameters on each of a bank of safe demand profiles; each rival is then refitted to the
+DESCRIPTION = """Recommend the next experiment: the log is diagnosed; every pair of effects that it cannot distinguish
+is simulated with its fitted parameters on each of a bank of safe demand profiles; each rival is then refitted to the
 other's run. The profile under which even the best refit stays farthest from the truth separates them best.
 
 examples:
@@ -47,7 +47,10 @@ def command(args: argparse.Namespace) -> int:
     else:
         rows = [[r["profile"], f"{r['nats']:.1f}", r["repeats"] or "-"] for r in e["table"]]
         terminal.print_table(
-            args, "divergence of the closest pair of rivals after refit", ["profile", "nats a run", "runs needed"], rows
+            args,
+            "divergence of the closest pair of rivals after refit",
+            ["profile", "log-likelihood ratio a run", "runs needed"],
+            rows,
         )
         terminal.say(args, answer.sentence())
     terminal.write_json(args, answer.to_dict())

@@ -21,14 +21,14 @@ __all__ = ["DESCRIPTION", "add_options", "command"]
 DESCRIPTION = """Add physical effects to the model, fit their parameters to a log, and write a model file that every
 command takes with --model.
 
-Effects that --model brings along are fitted again together with the new ones. Errors before and after are on data that
+Effects that --model contains are refitted together with the new ones. Errors before and after are on data that
 the parameters were not fitted to, beside the noise floor that no model can undercut.
 
 examples:
   vaneloop extend examples/hidden_effect.parquet --effect valve_dead_band --out with_dead_band.toml
   vaneloop extend examples/hidden_effect.parquet --model with_dead_band.toml --effect aero_load --out both.toml
 
-exit codes: 0 each stage extended is at its noise floor (within 10 %), 1 an error remains, or the effects
+exit codes: 0 each subsystem extended is at its noise floor (within 10 %), 1 an error remains, or the effects
 bring the model no nearer to the log (nothing is written then), 2 bad input"""
 
 
@@ -77,7 +77,7 @@ def command(args: argparse.Namespace) -> int:
             rows.append(
                 [r.stage, word(r, True), r.outputs[k], *figures, floors(r.error_after[k] / r.floor[k]), r.units[k]]
             )
-    columns = ["stage", "verdict", "signal", "error before", "error after", "noise floor", "after / floor", "unit"]
+    columns = ["subsystem", "verdict", "signal", "error before", "error after", "noise floor", "after / floor", "unit"]
     terminal.print_table(args, "errors are RMS on held-out data", columns, rows)
     options.say_tested(args, answer.tested)
     for r in results:

@@ -27,8 +27,8 @@ from vaneloop.pages.fleet import day, fleet_page
 
 __all__ = ["DESCRIPTION", "add_options", "command", "tell_damaged", "unusable"]
 
-DESCRIPTION = """Diagnose the logs of a fleet, and say which engine lacks what, since when, how fast it grows, and which
-engine is unlike its sisters.
+DESCRIPTION = """Diagnose the logs of a fleet, and report which engine lacks what, since when, how fast it grows, and
+which engine is unlike its fleet peers.
 
 A run is a folder. It can be killed at any moment: the same command goes on where it was, and takes up logs that are new
 or have changed. A log that cannot be read is a row with its reason. Any number of machines that see the folder can work
@@ -37,7 +37,7 @@ on it at once. Needs the extra `fleet`: pip install 'vaneloop[fleet]'. See docs/
   run     take up the logs and diagnose them
   work    join a run from this or another machine
   status  how far a run is
-  report  tables and a page of what the logs say together
+  report  tables and a page of what the logs have in common
 
 examples:
   vaneloop fleet run examples/ --out out/fleet
@@ -49,7 +49,7 @@ examples:
   vaneloop fleet report out/fleet --report fleet.html --tables-out TABLES
 
 exit codes: 0 done (report: nothing found), 1 a part of the run is damaged (report: or an engine lacks something or is
-unlike its sisters), 2 bad input"""
+unlike its fleet peers), 2 bad input"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -74,7 +74,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     run.add_argument("--system", metavar="MY.py", help="logs of a system of your own (docs/your_own_model.md)")
     work = parts.add_parser("work", help="join a run from this or another machine")
     status = parts.add_parser("status", help="how far a run is")
-    report = parts.add_parser("report", help="tables and a page of what the logs say together")
+    report = parts.add_parser("report", help="tables and a page of what the logs have in common")
     for part in (work, status, report):
         part.add_argument("run", metavar="RUN", help="folder of the run")
     _add_patience(work)
@@ -194,7 +194,7 @@ def _report(args: argparse.Namespace) -> int:
     columns = ["engine", "quantity", "change", "since", "a year, or step", "unit", "limit"]
     terminal.print_table(args, "what changes", columns, changes[:40])
     odd = [[r["engine"], r["quantity"], f"{r['value']:.4g}", f"{r['sisters']:.4g}", r["unit"]] for r in view.outliers]
-    terminal.print_table(args, "unlike their sisters", ["engine", "quantity", "value", "sisters", "unit"], odd[:40])
+    terminal.print_table(args, "unlike their fleet peers", ["engine", "quantity", "value", "peers", "unit"], odd[:40])
     tell_damaged(args, view.damaged)
     terminal.say(args, view.sentence())
     terminal.write_json(args, view.json())
@@ -214,7 +214,7 @@ def tell_damaged(args: argparse.Namespace, damaged: dict[str, str]) -> None:
     """Print what of a run's folder cannot be used."""
     if damaged:
         rows = [[name, why] for name, why in damaged.items()]
-        terminal.print_table(args, "damaged, and left out (the same fleet run does it anew)", ["part", "reason"], rows)
+        terminal.print_table(args, "damaged, and left out (the same fleet run repeats it)", ["part", "reason"], rows)
 
 
 def _patience(args: argparse.Namespace) -> float:

@@ -19,9 +19,9 @@ __all__ = ["DESCRIPTION", "add_options", "command"]
 DESCRIPTION = """Learn a law that the library does not have, of the vane chain or of a model of your own.
 
 Where diagnose says "unknown", learn looks for the law itself: at every place of the model, as a function of every
-quantity that the logs or the model know. It says where the law acts, of what it is a function, its curve with a band,
-and the simplest formulas that fit it. A law must earn its place on data that it was not fitted to, harm no test log,
-and do clearly better than laws with names. Where no honest law is there, it says so. docs/learn.md
+quantity that the logs or the model have. It reports where the law acts, its quantity, its curve with a band, and the
+simplest formulas that fit it. A law is accepted if it improves the fit to held-out data, degrades no validation log,
+and does clearly better than the laws of the library. If no law is accepted, the answer is "unknown". docs/learn.md
 
 examples:
   vaneloop learn LOG --fit :200 --test 200: --out LAW.toml --report LAW.html
@@ -29,8 +29,8 @@ examples:
   vaneloop extend NEW --system MY.py --effect LAW.toml --out BETTER.toml
   vaneloop compare NEW --system MY.py --model BETTER.toml
 
-exit codes: 0 nothing is missing, or laws with names say it; 1 a law was learned, or something is missing and no honest
-law was found; 2 bad input"""
+exit codes: 0 nothing is missing, or laws of the library explain it; 1 a law was learned, or something is missing
+and no law was accepted; 2 bad input"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -66,7 +66,7 @@ def command(args: argparse.Namespace) -> int:
     checked_shape(args.shape)
     own, asked = own_model.asked(args), {"shape": args.shape, "formulas": not args.curve}
     chain: Any = None if own else not_given(chain_of(args), args.without)
-    with terminal.progress_bar(args, "learning what nobody listed") as tell:
+    with terminal.progress_bar(args, "learning an unmodelled law") as tell:
         if own:
             answer = own_model.ask(args, "learn", without=args.without, **asked, progress=tell)
         else:

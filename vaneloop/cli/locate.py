@@ -13,15 +13,15 @@ from vaneloop.verbs.search import compared
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
-DESCRIPTION = """Find where the model fails: stage, direction of motion, speed, distance since reversal, stroke, rotor
-speed, oil temperature, supply pressure, time. Nominal parameters are refitted within their tolerance first.
-Significance is corrected for the number of conditions looked at.
+DESCRIPTION = """Find where the model fails: subsystem, direction of motion, speed, distance since reversal, stroke,
+rotor speed, oil temperature, supply pressure, time. Nominal parameters are refitted within their tolerance first.
+Significance is corrected for the number of conditions examined.
 
 examples:
   vaneloop locate examples/hidden_effect.parquet --report locate.html
   vaneloop locate examples/hidden_effect.parquet --model with_dead_band.toml --json -
 
-exit codes: 0 every stage fits everywhere, 1 at least one fails, 2 bad input"""
+exit codes: 0 every subsystem fits everywhere, 1 at least one fails, 2 bad input"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

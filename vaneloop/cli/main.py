@@ -20,9 +20,9 @@ COMMANDS = {
     "map": ("vaneloop.cli.map", "which name of a log is which signal, guessed and shown; writes a mapping file"),
     "compare": (
         "vaneloop.cli.compare",
-        "the model against a log: the whole loop, and each stage on its own logged inputs",
+        "the model against a log: the whole loop, and each subsystem on its own logged inputs",
     ),
-    "locate": ("vaneloop.cli.locate", "which stage fails, under which conditions, since when"),
+    "locate": ("vaneloop.cli.locate", "which subsystem fails, under which conditions, since when"),
     "diagnose": ("vaneloop.cli.diagnose", "which physical effects the model lacks, with probabilities and rivals"),
     "learn": ("vaneloop.cli.learn", "a law that the library does not have: where it acts, its curve, its formula"),
     "engine-test": (
@@ -34,7 +34,7 @@ COMMANDS = {
         "control strategies against each other on worn, hot, noisy engines: errors and cost",
     ),
     "extend": ("vaneloop.cli.extend", "add effects to the model, fitted to a log; writes a model file"),
-    "experiment": ("vaneloop.cli.experiment", "the demand profile that best tells the remaining rivals apart"),
+    "experiment": ("vaneloop.cli.experiment", "the demand profile that best separates the remaining rivals"),
     "fleet": ("vaneloop.cli.fleet", "many engines, many logs: who lacks what, since when, how fast it grows"),
     "campaign": (
         "vaneloop.cli.campaign",
@@ -48,7 +48,7 @@ COMMANDS = {
     "clearance": ("vaneloop.cli.clearance", "the hysteresis traced to clearances of the joints, in millimetres"),
     "inject": (
         "vaneloop.cli.inject",
-        "bad days on the bus, by scenario: frames and faults, and whether the controller reacted as it must",
+        "fault-injection scenarios: frames and faults on the bus, and whether the controller reacted as it must",
     ),
     "fuzz": (
         "vaneloop.cli.fuzz",

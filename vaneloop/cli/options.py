@@ -71,7 +71,7 @@ def parts_to_test(args: argparse.Namespace) -> list[str]:
 def say_tested(args: argparse.Namespace, rows: Any) -> None:
     """Print the errors on the part of the log that nothing was fitted to (`vaneloop.verbs.parts.Tested`)."""
     if rows:
-        columns = ["stage", "signal", "error before", "error after", "noise floor", "unit", "samples"]
+        columns = ["subsystem", "signal", "error before", "error after", "noise floor", "unit", "samples"]
         figures = [[f"{v:.4g}" for v in (r.error_before, r.error_after, r.noise_floor)] for r in rows]
         lines = [[r.stage, r.signal, *three, r.unit, f"{r.samples:,}"] for r, three in zip(rows, figures, strict=True)]
         terminal.print_table(args, "RMS error on the part that nothing was fitted to", columns, lines)

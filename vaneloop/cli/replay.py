@@ -104,7 +104,18 @@ def replayed(
         ]
         for s in result.signals
     ]
-    columns = ["signal", "stage", "against", "rms", "mean", "max", "mean 99-100 %", "noise floor", "unit", "samples"]
+    columns = [
+        "signal",
+        "subsystem",
+        "against",
+        "rms",
+        "mean",
+        "max",
+        "mean 99-100 %",
+        "noise floor",
+        "unit",
+        "samples",
+    ]
     terminal.print_table(
         args, f"{result.log}: {result.simulated_s:,.0f} s simulated in {result.wall_s:.2f} s", columns, rows
     )

@@ -19,11 +19,11 @@ from vaneloop.pages.schedule import schedule_page
 __all__ = ["DESCRIPTION", "add_options", "command", "log_of"]
 
 DESCRIPTION = """The stepwise scheduling method of Kim & Ki 2020: strokes for the VIGV's schedule, bell cranks and links
-of the other stages that best meet theirs, and, from a measured stroke-angle log, the loop split into its two curves,
+of the other vane rows that best meet theirs, and, from a measured stroke-angle log, the loop split into its two curves,
 made into stroke tables.
 
 The log needs x_lvdt and vigv (vgv1, ... where they were measured), the machine as built (lb of the geometry) driven
-there and back: any format that replay reads. Without a log the play is the geometry's own.
+there and back: any format that replay reads. Without a log the backlash is the geometry's own.
 
 examples:
   vaneloop schedule --report schedule.html
@@ -51,7 +51,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--schedules", metavar="F.toml", default="schedules.toml", help="target angles over speed (default: shipped)"
     )
     group.add_argument("--log", metavar="LOG", help=f"measured stroke-angle loop, a log: {options.A_LOG}")
-    group = parser.add_argument_group("adjusting the stages but the VIGV")
+    group = parser.add_argument_group("adjusting the vane rows but the VIGV")
     group.add_argument(
         "--step", metavar="MM", type=float, default=0.5, help="lengths change by multiples of it (default 0.5 mm)"
     )

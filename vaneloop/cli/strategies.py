@@ -35,9 +35,9 @@ from vaneloop.pages.strategies import report
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
 DESCRIPTION = """Compare the control strategies on the same engine run: single (one mean curve), dual (one curve a
-direction, the paper's), inverse (follows the play and crosses it when the vanes must turn round), adaptive (the same,
-and learns play and offset from the stem potentiometers). Six machines: nominal, worn, with thermal growth, dithered
-near 99 to 100 %, noisy, and all of it together; then the potentiometers fail in the middle of the last one.
+direction, the paper's), inverse (follows the backlash and crosses it when the vanes must turn round), adaptive (the
+same, and learns backlash and offset from the stem potentiometers). Six machines: nominal, worn, with thermal growth,
+dithered near 99 to 100 %, noisy, and all of it together; then the potentiometers fail in the middle of the last one.
 docs/strategies.md explains the strategies.
 
 examples:
@@ -45,10 +45,10 @@ examples:
   vaneloop strategies --play 2.0 --growth 0.3 --json -
   vaneloop strategies --tables engine7/ --seed 7
 
-exit codes: 0 all goals are held, 1 one is missed, 2 bad input"""
+exit codes: 0 all goals are met, 1 one is missed, 2 bad input"""
 
 _OPTIONS = {  # name -> default, low, high, unit, meaning
-    "play": (2.4, 0.0, 5.0, "deg", "total play of the worn VIGV; the other stages' in proportion"),
+    "play": (2.4, 0.0, 5.0, "deg", "total backlash of the worn VIGV; the other vane rows' in proportion"),
     "growth": (0.5, -2.0, 2.0, "deg", "turn of all vanes by the casing's heat at full speed"),
     "noise": (3.0, 0.0, 20.0, "X", "factor on the noise of all sensors"),
     "dither": (0.15, 0.0, 1.0, "%", "amplitude of the demand's dither between 99 and 100 %%"),
@@ -178,6 +178,6 @@ def _print(
     held = sum(g["held"] for g in goals)
     terminal.say(
         args,
-        f"goals held: {held} of {len(goals)}; {goals[0]['goal']}: {goals[0]['value']:.1f} (at least "
+        f"goals met: {held} of {len(goals)}; {goals[0]['goal']}: {goals[0]['value']:.1f} (at least "
         f"{goals[0]['limit']:g})",
     )

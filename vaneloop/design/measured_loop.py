@@ -150,7 +150,7 @@ def measure_loop(
     notes = []
     if fit.drift is None:
         notes.append(
-            "fewer than two loops there and back: a drift of the angle could not be told from the loop's width"
+            "fewer than two loops there and back: a drift of the angle cannot be distinguished from the loop's width"
         )
     reach = min(fit.covered[1][1], fit.covered[-1][1]), max(fit.covered[1][0], fit.covered[-1][0])
     if covered[0] > STROKE_LIMITS[0] + 3.0 or covered[1] < STROKE_LIMITS[1] - 4.0:

@@ -54,7 +54,7 @@ def write_tables(result: ScheduleResult, folder: str | Path) -> list[Path]:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise InputError(f"{folder}: cannot be made ({e.strerror})") from None
-    linkage = "Linkage of the vane stages, as measured and adjusted: vaneloop schedule."
+    linkage = "Linkage of the vane rows, as measured and adjusted: vaneloop schedule."
     texts = {
         "stroke_tables": _stroke_tables(result.table, result.origin),
         "geometry": _geometry(result.geometry, linkage),
@@ -90,8 +90,8 @@ def write_vane_angles(table: Array, geometry: Geometry, path: str | Path, origin
 
 def _vane_angles(table: Array, geometry: Geometry, origin: str) -> str:
     lines = [
-        "# Vane angles against stroke in the middle of the play, and the play: what the strategies inverse and "
-        "adaptive know.",
+        "# Vane angles over stroke in the middle of the backlash, and the backlash: the model that the strategies "
+        "inverse and adaptive use.",
         "",
     ]
     for stage in geometry.vanes:
@@ -103,7 +103,7 @@ def _vane_angles(table: Array, geometry: Geometry, origin: str) -> str:
     return "\n".join(lines)
 
 
-def write_geometry(geometry: Geometry, path: str | Path, words: str = "Linkage of the vane stages.") -> None:
+def write_geometry(geometry: Geometry, path: str | Path, words: str = "Linkage of the vane rows.") -> None:
     """Write a geometry as `plant.load_geometry` reads it, each number with its origin."""
     write(path, _geometry(geometry, words))
 

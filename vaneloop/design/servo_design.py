@@ -352,12 +352,12 @@ def design(
                 ("steady error on a 20 mm/s ramp", ramp["steady_error_mm"], limits.ramp_steady_mm, "mm"),
                 ("1 mA of null bias settled", bias["settled_s"], limits.bias_settled_s, "s"),
                 ("hunting by the converter's steps", rest["quantised_codes"], limits.hunting_at_rest_codes, "codes"),
-                ("hunting by play at the LVDT", hunting, limits.hunting_mm, "mm"),
+                ("hunting by backlash at the LVDT", hunting, limits.hunting_mm, "mm"),
                 *(("hunting by the valve's hysteresis", v, limits.hunting_mm, "mm") for v in by_valve),
             )
         ),
         Check(
-            "hunting by play outside the loop",
+            "hunting by backlash outside the loop",
             play[-1].simulated_lvdt_mm,
             1e-4,
             "mm",
@@ -420,7 +420,7 @@ def _say_play(p: PlayFigures) -> str:
         return "none" if a is None or hz is None else f"{a:.3g} {p.unit} at {hz:.2f} Hz"
 
     return (
-        f"play of {p.gap:g} {p.unit} {where}: limit cycle predicted {cycle(p.predicted_amplitude, p.predicted_hz)}, "
-        f"with harmonics {cycle(p.harmonic_amplitude, p.harmonic_hz)}, simulated "
-        f"{cycle(p.simulated_amplitude, p.simulated_hz)}"
+        f"backlash of {p.gap:g} {p.unit} {where}: limit cycle predicted "
+        f"{cycle(p.predicted_amplitude, p.predicted_hz)}, with harmonics {cycle(p.harmonic_amplitude, p.harmonic_hz)}, "
+        f"simulated {cycle(p.simulated_amplitude, p.simulated_hz)}"
     )

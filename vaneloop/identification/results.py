@@ -82,7 +82,7 @@ class StageDiagnosis:
     excess: float = 1.0  # whitened RMS after the best model
     nearest: list[str] = field(default_factory=list)  # where the verdict is unknown: the effects that come nearest
     refused: list[str] = field(default_factory=list)  # and why they are no answer, in words
-    gain: str = "gain on held-out data [nats]"  # what `Candidate.nats` counts
+    gain: str = "log-likelihood gain on held-out data"  # what `Candidate.nats` counts
     criterion: str = ""  # what an effect had to do to be named: `identification.selection.calibration.COEFFICIENTS`
     notes: list[str] = field(default_factory=list)  # what decided between rivals, what was left out, in words
 

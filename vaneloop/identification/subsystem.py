@@ -175,15 +175,17 @@ class Stage:
         m, n = len(self.outputs), len(self.t)
         self.measured = np.atleast_2d(np.asarray(self.measured, dtype=float))
         if self.measured.shape != (m, n):
-            raise StageError(f"stage {self.name!r}: measured has shape {self.measured.shape}; ({m}, {n}) is needed")
+            raise StageError(f"subsystem {self.name!r}: measured has shape {self.measured.shape}; ({m}, {n}) is needed")
         names = [p.name for p in self.parameters] + [e.name for e in self.effects]
         if len(set(names)) != len(names):
-            raise StageError(f"stage {self.name!r}: two parameters or effects share a name among {', '.join(names)}")
+            raise StageError(
+                f"subsystem {self.name!r}: two parameters or effects share a name among {', '.join(names)}"
+            )
         for e in self.effects:
             for s in e.starts:
                 if len(s) != len(e.parameters):
                     raise StageError(
-                        f"stage {self.name!r}, effect {e.name!r}: a start has {len(s)} values; {len(e.parameters)} "
+                        f"subsystem {self.name!r}, effect {e.name!r}: a start has {len(s)} values; {len(e.parameters)} "
                         f"are needed"
                     )
 

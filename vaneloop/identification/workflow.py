@@ -210,7 +210,9 @@ def _how_far(work: _Work, done: set[int]) -> tuple[float, str]:
         for i, stage in enumerate(work.stages)
         if i not in done and fits[i]
     ]
-    text = f"{len(done)} of {len(work.stages)} stages searched" + (f"; trying {', '.join(at_work)}" if at_work else "")
+    text = f"{len(done)} of {len(work.stages)} subsystems searched" + (
+        f"; trying {', '.join(at_work)}" if at_work else ""
+    )
     return sum(a * b for a, b in zip(share, size, strict=True)) / sum(size), text
 
 

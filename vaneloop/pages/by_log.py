@@ -38,8 +38,8 @@ def log_by_log(page: Page, by_log: ByLog) -> None:
     short = short_names(logs)
     page.section(
         "Log by log",
-        "RMS error of the model as it was given, then with each law added, every step fitted anew to the fitted logs "
-        "alone. A law that only imitates what is missing makes some test log worse.",
+        "RMS error of the model as it was given, then with each law added, every step refitted to the fitted logs "
+        "alone. A law that only imitates what is missing degrades some validation log.",
     )
     rows = [[short.get(log, log), what, d.outputs[k], *errors, d.units[k]] for log, what, k, errors, _ in by_log.rows()]
     page.table(["log", "fitted or test", "signal", *heads(by_log), "unit"], rows)
@@ -47,7 +47,7 @@ def log_by_log(page: Page, by_log: ByLog) -> None:
         names = list(by_log.ablation)
         page.section(
             "Which law helps where",
-            "Error with the law over error without it; 1: it does nothing there, above 1: it does harm there.",
+            "Error with the law over error without it; 1: no change, above 1: it degrades that log.",
         )
         page.table(["law", *(short[x] for x in logs)], [[n, *(by_log.ablation[n][x] for x in logs)] for n in names])
         page.plot(
@@ -61,7 +61,7 @@ def log_by_log(page: Page, by_log: ByLog) -> None:
         )
         for n in names:
             if idle := [x for x in logs if by_log.ablation[n][x] > NO_HELP]:
-                page.text(f"{n} hardly helps, or does harm, on {', '.join(short[x] for x in idle)}.")
+                page.text(f"{n} hardly helps, or degrades, {', '.join(short[x] for x in idle)}.")
     if fitted.stage.parameters:
         page.section("Parameters of the model")
         page.table(

@@ -135,8 +135,8 @@ def campaign_page(view: CampaignView, command: str = "") -> Page:
     page.section(
         "Result",
         f"Failure probability of a machine drawn uniformly from the tolerances, with its {100.0 * view.confidence:g} % "
-        "interval (Clopper-Pearson, which takes the samples as independent; points of a Sobol sequence are spread more "
-        "evenly than that). The least margin is a share: 1 is as good as can be, 0 is at the limit, below 0 is broken.",
+        "interval (Clopper-Pearson, which takes the samples as independent; points of a Sobol sequence are distributed "
+        "more evenly than that). The least margin is a share: 1 is the best, 0 is at the limit, below 0 is broken.",
     )
     page.table(
         ["combination", "passes", "machines", "without answer", "failed", "probability", "low", "high", "least margin",
@@ -176,7 +176,7 @@ def _group(page: Page, view: CampaignView, g: GroupView) -> None:
         )
     line = Line("machines", *distribution(g.shares), "model", 2.2)
     page.plot(overlay([Panel("share of machines", [line])], "least margin at or below", 320),
-              "How the least margin is spread over the machines.", half=True)  # fmt: skip
+              "Distribution of the least margin over the machines.", half=True)  # fmt: skip
     if g.total:
         order = np.argsort(-np.array(total)).tolist()
         page.table(

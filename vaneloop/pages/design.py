@@ -20,7 +20,7 @@ def design_page(result: DesignResult, path: str | Path) -> Path:
     """Write a self-contained HTML page: checks, open loop, Nyquist with the disk, steps, ramp, limit cycles."""
     g, m, c = result.gains, result.nominal, result.curves
     missed = [k.name for k in result.checks if not k.ok]
-    verdict = "All stated limits hold." if result.ok else "Not held: " + "; ".join(missed) + "."
+    verdict = "All stated limits hold." if result.ok else "Not met: " + "; ".join(missed) + "."
     tone: Literal["good", "bad"] = "good" if result.ok else "bad"
     page = Page("Design of the servo loop", verdict, tone=tone, subtitle="vaneloop design", command="vaneloop design")
     for label, value, unit, note in (
@@ -146,13 +146,13 @@ def design_page(result: DesignResult, path: str | Path) -> Path:
     page.plot(step, "Linear closed loop, no feed-forward, no limit.")
 
     page.section(
-        "Limit cycles by play",
-        "With an integral in the controller any play inside the loop sustains a slow oscillation: the loop must cross "
-        "the curve -1/N(A). Its size is about half the gap and it grows with ki/kp. Play between piston and vanes is "
-        "not seen by the LVDT and is not in the loop: nothing to cross, no oscillation, only lost motion.\n\nThe "
-        "describing function takes the motion before the play for a sine. Where the piston hardly leaves its gap "
-        "(grazing), it is not: the amplitude holds within some 10 %, the frequency within some 50 %. The column 'with "
-        "harmonics' solves the same balance with all odd harmonics and has no such error.",
+        "Limit cycles by backlash",
+        "With an integral in the controller any backlash inside the loop sustains a slow oscillation: the loop must "
+        "cross the curve -1/N(A). Its size is about half the gap and it grows with ki/kp. Backlash between piston and "
+        "vanes is not seen by the LVDT and is not in the loop: nothing to cross, no oscillation, only lost motion.\n\n"
+        "The describing function takes the motion before the backlash for a sine. Where the piston hardly leaves its "
+        "gap (grazing), it is not: the amplitude holds within some 10 %, the frequency within some 50 %. The column "
+        "'with harmonics' solves the same balance with all odd harmonics and has no such error.",
     )
     page.table(
         [
@@ -184,7 +184,7 @@ def design_page(result: DesignResult, path: str | Path) -> Path:
             ]
             for p in result.play
         ],
-        "Amplitudes of the fundamental before the play.",
+        "Amplitudes of the fundamental before the backlash.",
     )
     amplitude = 0.5 + np.geomspace(0.02, 30.0, 300)
     inverse = -1.0 / play_describing_function(amplitude, 1.0)
@@ -211,9 +211,9 @@ def design_page(result: DesignResult, path: str | Path) -> Path:
         else:
             lines.append(Line("LVDT", run.t[last], 1e3 * (run.x_lvdt[last] - MIDDLE), "measured"))
         where = {
-            "lvdt": "Play between piston and LVDT.",
+            "lvdt": "Backlash between piston and LVDT.",
             "valve": "Hysteresis in the valve.",
-            "vanes": "Play between piston and vanes, after a reversal.",
+            "vanes": "Backlash between piston and vanes, after a reversal.",
         }[site]
         page.plot(overlay([Panel("stroke about mid-stroke [mm]", lines)], height=440), where, half=True)
     return page.write(path)

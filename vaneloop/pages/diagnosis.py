@@ -54,15 +54,15 @@ def verdict_sentence(d: Diagnosis, by_log: ByLog | None = None) -> str:
     for s in d.stages:
         if s.verdict == "missing":
             names = [f"{f.effect}" + (f" (or {', '.join(f.rivals)})" if f.rivals else "") for f in s.effects]
-            parts.append(f"the {s.stage} stage lacks {' and '.join(names)}")
+            parts.append(f"the {s.stage} subsystem lacks {' and '.join(names)}")
         elif s.verdict == "unknown":
             first = d.shapes.get(s.stage, [])
             what = f": {first[0].text}" if first else ""
-            parts.append(f"the {s.stage} stage lacks something that the library does not have{what}")
+            parts.append(f"the {s.stage} subsystem lacks something that the library does not have{what}")
     if not parts:
         silent = untold(d.not_observed)
-        which = "that the log tells of " if silent else ""
-        return f"Nothing is missing: every stage {which}fits its measurements down to the noise floor.{silent}"
+        which = "observed " if silent else ""
+        return f"Nothing is missing: every {which}subsystem fits its measurements down to the noise floor.{silent}"
     text = "; ".join([*parts, by_log.sentence()] if by_log is not None else parts)
     return f"{capital(text)}.{untold(d.not_observed)}"
 
@@ -80,17 +80,17 @@ def located_sentence(
         more = f" So it is in {len(at_times) - 1} stretches more." if len(at_times) > 1 else ""
         return f"Most of the log fits its measurements, but the {at_times[0]}.{more}{silent}"
     if not failing:
-        which = "that the log tells of " if silent else ""
-        return f"Every stage {which}fits its measurements to within the noise.{silent}"
+        which = "observed " if silent else ""
+        return f"Every {which}subsystem fits its measurements to within the noise.{silent}"
     worst = max(failing, key=lambda x: x.worst.ratio)
     s = worst.worst
     if s.agrees:  # no more than noise over the whole log
-        where = "; ".join(f"the {x.stage} stage fails at {x.hot[0].worst()}" for x in failing)
-        return f"Over the whole log every stage fits its measurements, but {where}.{silent}"
+        where = "; ".join(f"the {x.stage} subsystem fails at {x.hot[0].worst()}" for x in failing)
+        return f"Over the whole log every subsystem fits its measurements, but {where}.{silent}"
     others = [x.stage for x in failing if x is not worst]
     also = f" {' and '.join(others)} {'fail' if len(others) > 1 else 'fails'} too." if others else ""
     off = f"{s.signal} is off by {number(s.rms)} {s.unit} RMS, {floors(s.ratio)} times its noise floor"
-    return f"The model fails most in the {worst.stage} stage: {off}.{also}{silent}"
+    return f"The model fails most in the {worst.stage} subsystem: {off}.{also}{silent}"
 
 
 def located_tone(located: Sequence[Located]) -> Tone:
@@ -131,10 +131,10 @@ def compare_page(
             located_tone([x]),
         )
     page.section(
-        "Stage by stage",
-        "Each stage is driven by its own logged inputs, so one stage's error cannot hide behind another's, as it does "
-        "in closed loop. Nominal parameters are refitted within their tolerances; beside it the error with the "
-        "parameters as given.",
+        "By subsystem",
+        "Each subsystem is driven by its own logged inputs, so an error of one cannot be hidden by another, as in "
+        "closed loop. Nominal parameters are refitted within their tolerances; beside it the error with the parameters "
+        "as given.",
     )
     rows: list[list[object]] = [
         [x.stage, word_of_located(x), f.signal, f.rms, f.noise_floor, f.ratio, f.rms_as_given, f.unit,
@@ -144,7 +144,9 @@ def compare_page(
     rows += [
         [name, f"{CANNOT}: {why}", "", None, None, None, None, "", None] for name, why in bound.not_observed.items()
     ]
-    page.table(["stage", "verdict", "signal", "RMS error", "noise floor", "ratio", "as given", "unit", "samples"], rows)
+    page.table(
+        ["subsystem", "verdict", "signal", "RMS error", "noise floor", "ratio", "as given", "unit", "samples"], rows
+    )
     _tested(page, tested)
     for x in located:
         page.text(f"{x.stage}: {x.verdict()}.")
@@ -162,7 +164,7 @@ def _tested(page: Page, rows: Sequence[Any]) -> None:
     """Errors on the part of the log that nothing was fitted to (`vaneloop.verbs.parts.Tested`)."""
     if rows:
         page.section("On the part that nothing was fitted to", "RMS error with the parameters of the fitted part.")
-        columns = ["stage", "signal", "error before", "error after", "noise floor", "unit", "samples"]
+        columns = ["subsystem", "signal", "error before", "error after", "noise floor", "unit", "samples"]
         page.table(
             columns,
             [[r.stage, r.signal, r.error_before, r.error_after, r.noise_floor, r.unit, r.samples] for r in rows],
@@ -232,9 +234,9 @@ def _told(
     if experiment:
         _next(page, experiment)
     page.section(
-        "What each stage says",
-        "A stage is judged on its own logged inputs. Errors are RMS on data that the parameters were not fitted to; a "
-        "complete model stands at its noise floor.",
+        "Answer of each subsystem",
+        "Each subsystem is judged on its own logged inputs. Errors are RMS on held-out data, to which the parameters "
+        "were not fitted; a complete model is at its noise floor.",
     )
     rows: list[list[object]] = []
     for s in d.stages:
@@ -243,7 +245,7 @@ def _told(
                 [s.stage, word(s, extended), s.outputs[k], s.error_before[k], s.error_after[k], s.floor[k], s.units[k]]
             )
     rows += [[name, f"{CANNOT}: {why}", "", None, None, None, ""] for name, why in d.not_observed.items()]
-    page.table(["stage", "verdict", "signal", "error before", "error after", "noise floor", "unit"], rows)
+    page.table(["subsystem", "verdict", "signal", "error before", "error after", "noise floor", "unit"], rows)
     _floors_anew(page, d, bound)
     _tested(page, tested)
     found = [(s, f) for s in d.stages for f in s.effects]
@@ -261,7 +263,13 @@ def _told(
                 rows.append([f.effect, s.stage, *sure, *row, *([] if extended else [doubt(f) or "none"])])
         columns = ["parameter", "value", "low", "high", "unit"]
         page.table(
-            ["effect", "stage", *([] if extended else ["probability"]), *columns, *([] if extended else ["rivals"])],
+            [
+                "effect",
+                "subsystem",
+                *([] if extended else ["probability"]),
+                *columns,
+                *([] if extended else ["rivals"]),
+            ],
             rows,
         )
     if by_log is not None:
@@ -293,7 +301,7 @@ def _told(
             "What this log cannot show",
             "These effects would have left no trace here, however large: their absence is not shown.",
         )
-        page.table(["effect", "stage", "what would excite it"], unseen)
+        page.table(["effect", "subsystem", "what would excite it"], unseen)
     page.notes(d.notes)
     return page
 
@@ -321,10 +329,10 @@ def _floors_anew(page: Page, d: Diagnosis, bound: Bound) -> None:
 def _stage_story(page: Page, s: StageDiagnosis, bound: Bound, extended: bool) -> None:
     stage = _stage(bound, s.stage)
     judge = LeastSquaresProblem(stage, s.floor)
-    page.section(f"The {s.stage} stage", f"Verdict: {word(s, extended)}.{_correlated(s.correlation)}")
+    page.section(f"The {s.stage} subsystem", f"Verdict: {word(s, extended)}.{_correlated(s.correlation)}")
     page.plot(
         waterfall(falling(s), "held-out error [noise floors]", floor=1.0, told=floors),
-        "How the error falls as effects are added, down to the noise floor. All outputs of the stage together.",
+        "How the error falls as effects are added, down to the noise floor. All outputs of the subsystem together.",
     )
     if worth := worths(s):
         page.plot(
@@ -333,8 +341,8 @@ def _stage_story(page: Page, s: StageDiagnosis, bound: Bound, extended: bool) ->
                 highlight=[w.effect for w in worth],
                 log=True, marks={"with all": s.excess, "nominal": s.steps[0][1]},
             ),
-            "What each effect is worth in the final model: the error that comes back without it, the others fitted "
-            "anew.",
+            "What each effect is worth in the final model: the error that comes back without it, the others "
+            "refitted.",
         )  # fmt: skip
     curves = [("nominal model", s.base.theta, "error")]
     if s.final.effects:
@@ -389,7 +397,7 @@ def _correlated(factor: float) -> str:
 def _failure_map(page: Page, located: Located, drawn: int, when: str = "") -> None:
     """Draw where a stage fails; ``drawn``: the plot of its curves, which a click on a cell moves to the moment."""
     if located.onset is not None:
-        page.text(f"The error of the {located.stage} stage begins at t = {located.onset:.0f} s.")
+        page.text(f"The error of the {located.stage} subsystem begins at t = {located.onset:.0f} s.")
     for output in dict.fromkeys(r.output for r in located.hot):
         mine = [r for r in located.hot if r.output == output]
         (k, b), figure = worst_cell(mine), failure_map(mine)
@@ -397,6 +405,6 @@ def _failure_map(page: Page, located: Located, drawn: int, when: str = "") -> No
         said = f" {when} anything was added" if when else ""
         page.plot(
             figure,
-            f"Where the {located.stage} stage fails{said}: error of {output} in noise floors. "
+            f"Where the {located.stage} subsystem fails{said}: error of {output} in noise floors. "
             f"Worst: {mine[k].told(b)}. A click on a cell shows its moment in the curves above.",
         )

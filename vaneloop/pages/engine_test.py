@@ -126,7 +126,7 @@ def engine_test_report(
     )
 
     page.section(
-        "How the errors are spread",
+        "Distribution of the errors",
         "Share of the samples at each size of error: one curve leaves two hills, one for each direction.",
     )
     page.plot(

@@ -114,7 +114,7 @@ class FleetView:
         return (
             f"Of {n} engines {len(lack)} {'lacks' if len(lack) == 1 else 'lack'} an effect in the model, {len(change)} "
             f"{'changes' if len(change) == 1 else 'change'} over time, {len(odd)} {'is' if len(odd) == 1 else 'are'} "
-            f"unlike {'its' if len(odd) == 1 else 'their'} sisters."
+            f"unlike {'its' if len(odd) == 1 else 'their'} fleet peers."
         )
 
     def keys(self) -> list[str]:
@@ -149,7 +149,7 @@ def fleet_page(view: FleetView, command: str = "", logs: str = "") -> Page:
     page.tile("diagnosed", view.statuses.get("done", 0))
     page.tile("engines that lack an effect", len({r["engine"] for r in view.lacking}))
     page.tile("trends", len(view.changed), note="quantities that have changed")
-    page.tile("unlike their sisters", len({r["engine"] for r in view.outliers}))
+    page.tile("unlike their fleet peers", len({r["engine"] for r in view.outliers}))
     _lacks(page, view, logs)
     _trends(page, view, logs)
     _outliers(page, view)
@@ -159,7 +159,7 @@ def fleet_page(view: FleetView, command: str = "", logs: str = "") -> Page:
         rows = [[r["engine"], r["path"], r["status"], r["reason"]] for r in view.refused]
         _table(page, ["engine", "log", "what came of it", "reason"], rows)
     if view.damaged:
-        page.section("Damaged parts of the run", "What they held is not in this report.")
+        page.section("Damaged parts of the run", "Their results are not in this report.")
         _table(page, ["part", "reason"], list(view.damaged.items()))
     return page
 
@@ -191,7 +191,7 @@ def _lacks(page: Page, view: FleetView, logs: str) -> None:
         for r in view.lacking
     ]  # fmt: skip
     if rows_:
-        columns = ["engine", "effect", "stage", "named in", "of logs", "mean probability", "first", "last", "log"]
+        columns = ["engine", "effect", "subsystem", "named in", "of logs", "mean probability", "first", "last", "log"]
         _table(page, columns, rows_)
 
 
@@ -247,13 +247,13 @@ def _drawn(s: Series) -> Figure:
 
 def _outliers(page: Page, view: FleetView) -> None:
     page.section(
-        "Unlike their sisters",
+        "Unlike their fleet peers",
         "Engines of which a nominal parameter, as recalibrated, is farther from that of the others than one healthy "
         "engine in a hundred would be in any of its parameters.",
     )
     rows = [[r["engine"], r["quantity"], r["value"], r["sisters"], r["unit"], r["p"]] for r in view.outliers]
     if rows:
-        _table(page, ["engine", "quantity", "value", "its sisters", "unit", "probability if healthy"], rows)
+        _table(page, ["engine", "quantity", "value", "its fleet peers", "unit", "probability if healthy"], rows)
     else:
         page.text("None.")
 
@@ -265,13 +265,13 @@ def _coverage(page: Page, view: FleetView) -> None:
         by.setdefault((r["stage"], r["effect"]), []).append(r)
     total = {e: sum(v.values()) for e, v in view.verdicts.items()}
     rows = [
-        [stage, effect or "(the whole stage)", sum(r["logs"] for r in group), sum(total.values()),
+        [stage, effect or "(the whole subsystem)", sum(r["logs"] for r in group), sum(total.values()),
          sum(r["logs"] == r["of"] for r in group), group[0]["needs"] or "–"]
         for (stage, effect), group in by.items()
     ]  # fmt: skip
     rows.sort(key=lambda r: (-int(str(r[2])), str(r[1])))
     if rows:
-        _table(page, ["stage", "effect", "not shown in", "of logs", "engines never", "needs"], rows)
+        _table(page, ["subsystem", "effect", "not shown in", "of logs", "engines never", "needs"], rows)
     else:
         page.text("Every log could show every effect.")
 
@@ -333,7 +333,7 @@ def log_page(key: str, answer: dict[str, Any]) -> Page:
     if answer["effects"]:
         page.section("Effects")
         page.table(
-            ["effect", "stage", "probability", "parameter", "value", "low", "high", "unit", "as good"],
+            ["effect", "subsystem", "probability", "parameter", "value", "low", "high", "unit", "as good"],
             [[e["effect"], e["stage"], e["probability"], n, p["value"], p["low"], p["high"], p["unit"],
               ", ".join(e["rivals"]) or "–"] for e in answer["effects"] for n, p in e["parameters"].items()],
         )  # fmt: skip

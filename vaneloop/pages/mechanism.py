@@ -37,7 +37,7 @@ def clearance_page(studies: list[ClearanceStudy], path: str, command: str, vane:
     page.section(
         "What each joint adds",
         "Width of the loop that each joint's clearance makes by itself; together they add up. Clearance before the "
-        "crank's lower arm counts with the stage's slope, clearance after it with 1.6 deg for each mm in every stage.",
+        "crank's lower arm counts with the vane row's slope, clearance after it with 1.6 deg for each mm in every row.",
     )
     roles = STAGE_ROLES[: len(names)]
     series: dict[str, list[float | None]] = {
@@ -49,8 +49,8 @@ def clearance_page(studies: list[ClearanceStudy], path: str, command: str, vane:
     page.section(
         "The loop in space",
         "Extension and retraction branch of the mechanism with these clearances, less their mean. With friction the "
-        "ring stays anywhere between, which is the play operator of the simulated machine; dotted: that operator, of "
-        "constant width at the ring.",
+        "ring stays anywhere between, which is the backlash (play operator) of the simulated machine; dotted: that "
+        "operator, of constant width at the ring.",
     )
     lines = []
     for n, s, role in zip(names, studies, roles, strict=True):
@@ -115,5 +115,5 @@ def spatial_page(check: SpatialCheck, path: str, command: str) -> Any:
             "Exudyn's rigid bodies and joints against Newton's method on the loop's equations: rounding.",
         )
         rows = [[s.upper(), f"{np.max(np.abs(check.multibody[s] - check.newton[s])):.1e}"] for s in vanes]
-        page.table(["stage", "largest difference [deg]"], rows)
+        page.table(["vane row", "largest difference [deg]"], rows)
     return page.write(path)

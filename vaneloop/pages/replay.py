@@ -56,8 +56,8 @@ def replay_page(result: Result, command: str = "", title: str | None = None) -> 
     if measured:
         page.section(
             "Signal by signal",
-            "Blue is what was measured, orange what the model says. The error below each pair has a grey band three "
-            "noise floors wide on each side of zero: what stays inside cannot be told from sensor noise.",
+            "Blue is measured, orange is the model. The error below each pair has a grey band three "
+            "noise floors wide on each side of zero: an error inside it cannot be distinguished from sensor noise.",
         )
         worst_first = sorted(measured, key=lambda s: -_ratio(s))
         for s in worst_first:
@@ -65,7 +65,7 @@ def replay_page(result: Result, command: str = "", title: str | None = None) -> 
                 page.plot(_against_measurement(result, s), _in_words(s))
         _worst_moment(page, result, worst_first[0])
         page.section(
-            "How the errors are spread",
+            "Distribution of the errors",
             "Share of samples at each size of error. A hill on zero as narrow as the dotted curve is noise alone; a "
             "shifted hill is a bias, two hills are a hysteresis that the model has too wide or too narrow, a long tail "
             "is a disagreement in a few moments.",

@@ -56,7 +56,7 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
     )
     page = Page(
         "Stroke schedule and links",
-        (verdict or "One stage: its stroke is what meets the schedule") + ".",
+        (verdict or "One vane row: its stroke is what meets the schedule") + ".",
         subtitle="schedule",
         command=command,
         log=result.log,
@@ -97,7 +97,7 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
 
     page.section(
         "Schedule and result",
-        "One stroke serves all stages: it is scheduled for the VIGV; the others follow as their lengths let them. "
+        "One stroke serves all vane rows: it is scheduled for the VIGV; the others follow as their lengths let them. "
         "Error is target minus angle.",
     )
     angle_lines, error_lines = [], []
@@ -128,7 +128,7 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
                 roles={"as first built": "bad", "as it is": "model", "adjusted": "good"},
             )
         )
-    columns = ["stage", "state", "Lb [mm]", "Lc [mm]", "at 100 % [deg]", "rms [deg]", "max [deg]"]
+    columns = ["vane row", "state", "Lb [mm]", "Lc [mm]", "at 100 % [deg]", "rms [deg]", "max [deg]"]
     rows: list[list[object]] = []
     for s in result.links:
         for name, words in (("initial", "as first built"), ("built", "as it is"), ("adjusted", "adjusted")):

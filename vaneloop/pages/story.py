@@ -81,9 +81,9 @@ def doubt(f: Found) -> str:
     """What this log cannot tell about an effect; "": nothing."""
     out = []
     if f.rivals:
-        out.append(f"this log cannot tell it from {' or '.join(f.rivals)}")
+        out.append(f"this log cannot distinguish it from {' or '.join(f.rivals)}")
     if f.inseparable:
-        out.append(f"this log cannot tell its cause from {' or '.join(f.inseparable)}")
+        out.append(f"this log cannot distinguish its cause from {' or '.join(f.inseparable)}")
     return "; ".join(out)
 
 

@@ -41,7 +41,7 @@ def report(
         f"On a worn, hot, noisy engine with a dithering demand the VIGV is off by {number(errors[1]['mean_abs'])} deg "
         f"on average under {best}, by {number(errors[0]['mean_abs'])} deg under the dual curves: "
         f"{goals[0]['value']:.1f} times less, with {mine.travel / max(dual.travel, 1e-9):.2f} of the travel. "
-        + (f"{len(missed)} of {len(goals)} goals are missed." if missed else f"All {len(goals)} goals are held."),
+        + (f"{len(missed)} of {len(goals)} goals are missed." if missed else f"All {len(goals)} goals are met."),
         tone="bad" if missed else "good",
         subtitle=f"{', '.join(v.upper() for v in plant.vanes)}, closed loop of firmware and plant",
         command=words,
@@ -98,7 +98,7 @@ def report(
     worn = 0.0 if last.play is None else last.play - plant.geometry.vigv.hysteresis.value
     growth = last.growth / HEAT * (casing(adaptive.n_r) - T_REF)
     t, grown = adaptive.t, np.full(len(adaptive.t), worn)
-    page.section("What adaptive learns", "Offset and play beyond the one as built: as learned and as they are.")
+    page.section("What adaptive learns", "Offset, and backlash beyond the one as built: as learned and as they are.")
     page.plot(
         overlay(
             [
@@ -106,7 +106,7 @@ def report(
                     "offset [deg]", [Line("true", t, growth, "muted"), Line("learned", t, adaptive.offset, "measured")]
                 ),
                 Panel(
-                    "play beyond built [deg]",
+                    "backlash beyond built [deg]",
                     [Line("true", t, grown, "muted"), Line("learned", t, adaptive.width, "measured")],
                 ),
             ]
@@ -124,9 +124,10 @@ def report(
     if failures:
         page.section(
             "Potentiometers that fail",
-            "All fail at once, after the middle of the run. The compensation stays as learned; nothing jumps. A "
-            "drift slower than what the casing may do cannot be told from growth: it is followed, slowly, up to the "
-            "limit of the offset, and may leave more error than dual has. Step: what the failure changes within 1 s.",
+            "All fail at once, after the middle of the run. The compensation stays as learned; nothing jumps. "
+            "A drift slower than what the casing may do cannot be distinguished from growth: it is followed, slowly, "
+            "up to the limit of the offset, and may leave more error than dual has. Step: what the failure changes "
+            "within 1 s.",
         )
         page.table(
             [

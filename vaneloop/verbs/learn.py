@@ -80,8 +80,8 @@ class Learned(Answer):
         if not self.laws:
             said = {
                 "none": "Nothing is missing",
-                "named": "Laws with names say it",
-                "unknown": "No honest law of one quantity or two is there",
+                "named": "Laws of the library explain it",
+                "unknown": "No law of one or two quantities was accepted",
             }[self.verdict]
             if self.verdict == "unknown" and self.steps:
                 said = "A reading lacks bits"
@@ -108,7 +108,7 @@ class Learned(Answer):
             if law.untold:
                 what = " and ".join(("mean", "slope")[k] for k in law.untold)
                 trades = f"; it trades with {', '.join(law.trades)}" if law.trades else ""
-                out.append(f"{law.name}: its {what} cannot be told from these logs{trades}")
+                out.append(f"{law.name}: its {what} cannot be estimated from these logs{trades}")
             if law.rivals:
                 out.append(f"{law.name}: as good: {', '.join(law.rivals)}")
             out.append(law.range_note())
@@ -237,7 +237,9 @@ def learned(
         if formulas:
             last, own = spoken(learner, one.tried, own)
         new = [k for k, law in enumerate(own) if not any(law.of_the_kind_of(known) for known in laws)]
-        said += [f"{d.stage}: {law.name}: another stage says it, too" for k, law in enumerate(own) if k not in new]
+        said += [
+            f"{d.stage}: {law.name}: another subsystem has the same law" for k, law in enumerate(own) if k not in new
+        ]
         laws += [own[k] for k in new]
         if new:
             kept = replace(one, tried=[one.tried[k] for k in new])

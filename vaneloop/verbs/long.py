@@ -93,8 +93,8 @@ class Whole:
         """What is fitted, in words."""
         fitted, seconds = len(chosen) * PIECE, self.grid.rows * self.grid.dt
         return (
-            f"a long log: {fitted:,.0f} s of {seconds:,.0f} are fitted, pieces of {PIECE:.0f} s from beginning to end "
-            f"that have been wherever it has been; what they say is held against all of it"
+            f"a long log: {fitted:,.0f} s of {seconds:,.0f} are fitted, in pieces of {PIECE:.0f} s that cover its "
+            f"whole operating range; the result is checked on all of it"
         )
 
     def changed(self, change: Callable[[Chain], Chain]) -> Whole:
@@ -330,7 +330,7 @@ def searched(
         d = search(
             chain.stages, chain.not_observed, None, workers, news=lambda n: tell(0.6 * n.fraction, n.text, n.found)
         )
-        held = _held(chain, d.stages, workers, lambda f: tell(0.6 + 0.4 * f, "held against the whole log"))
+        held = _held(chain, d.stages, workers, lambda f: tell(0.6 + 0.4 * f, "checking the whole log"))
         new = [k for k in held.pieces if k not in chain.whole.chosen][:MORE]
         if again == ROUNDS or not new:
             break

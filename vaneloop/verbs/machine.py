@@ -120,7 +120,7 @@ class Machine:
         chain = build_chain(log, self.plant, self.calibration, present, grid, pieces, **few)
         if not chain.stages:
             why = "; ".join(f"{k}: {v}" for k, v in chain.not_observed.items())
-            raise LogError(f"{log.path}: no stage can be judged ({why})")
+            raise LogError(f"{log.path}: no subsystem can be judged ({why})")
         return chain
 
 

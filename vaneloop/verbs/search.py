@@ -427,7 +427,7 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
             where = seen_in(shown)
             if where is None:
                 why = chain.not_observed.get(shown[0], "not observed")
-                raise InputError(f"{log}: --effect {name}: the log does not show its stage ({shown[0]}: {why})")
+                raise InputError(f"{log}: --effect {name}: the log does not show its subsystem ({shown[0]}: {why})")
             by_stage.setdefault(where, []).append(name)
             curves.setdefault(where, []).append(curve_effect(name, law))
             continue
@@ -438,7 +438,7 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
             by_stage.setdefault(stage, []).append(name)
         elif name in wanted:
             why = "; ".join(f"{s}: {chain.not_observed.get(s, 'not observed')}" for s in EFFECTS[name].stages)
-            raise InputError(f"{log}: --effect {name}: the log does not show its stage ({why})")
+            raise InputError(f"{log}: --effect {name}: the log does not show its subsystem ({why})")
 
     def with_curves(stages: Chain) -> Chain:
         """The stages as they are fitted: those with a learned law have its curve."""

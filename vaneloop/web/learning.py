@@ -86,8 +86,8 @@ class LearnedPart:
         if learned is None:
             if unknown_stages(s):
                 ui.label(
-                    "The library does not have what acts here. A law can be learned from this log: at every place of "
-                    "the model, as a function of every quantity that the log knows."
+                    "The library has no effect that explains this error. A law can be learned from this log: at every "
+                    "place of the model, as a function of every quantity that the log has."
                 ).classes("note")
             return
         ui.label(learned["sentence"]).classes(f"verdict learned {TONES.get(learned['verdict'], 'bad')}")

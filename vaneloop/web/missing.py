@@ -73,7 +73,7 @@ class _Page:
             live.complaint("compare")
             live.progress("compare")
             hint = ui.label(
-                "Choose a log: each stage of the machine is then driven by its own logged inputs and compared."
+                "Choose a log: each subsystem of the machine is then driven by its own logged inputs and compared."
             ).classes("soft")
             live.shown(hint, lambda: s.choice.file is None, "compare", "log")
             live.part(self._compared, "compare", shows=lambda: (s.compared,))
@@ -106,7 +106,9 @@ class _Page:
             )
         for name, why in c["not_observed"].items():
             rows.append([name, f"{CANNOT}: {why}", "", "", "", "", ""])
-        table(["stage", "signal", "RMS error", "noise floor", "unit", "noise floors", "size"], rows, numbers=(2, 3, 5))
+        table(
+            ["subsystem", "signal", "RMS error", "noise floor", "unit", "noise floors", "size"], rows, numbers=(2, 3, 5)
+        )
         given = [
             f"{f.signal} {floors(f.rms_as_given / f.noise_floor)}"
             for f in c["figures"]
@@ -172,8 +174,8 @@ class _Page:
         s, live = self.s, self.live
         with card("3  What is missing?"):
             words = (
-                "After the comparison: every effect of the library is fitted, and what earns its place on "
-                "held-out data is named."
+                "After the comparison: every effect of the library is fitted, and those that improve the fit to "
+                "held-out data are accepted."
             )
             live.shown(ui.label(words).classes("soft"), lambda: s.compared is None, "compare", "log")
             start = (
@@ -222,8 +224,8 @@ class _Page:
         s = self.s
         windows = s.compared["windows"] if s.compared is not None else {}
         text = (
-            f"The {s.stage} stage on its own logged inputs: measured, model and error. Grey band: three noise floors "
-            f"to each side.{jumps(windows.get(s.stage))}"
+            f"The {s.stage} subsystem on its own logged inputs: measured, model and error. Grey band: three noise "
+            f"floors to each side.{jumps(windows.get(s.stage))}"
             if s.stage
             else ""
         )
@@ -246,8 +248,8 @@ class _Page:
             for u in j["unknown"]:
                 left = "; ".join(x for x in u["shape"].split("; ") if x not in s.diagnosis["verdict"])
                 near = ", ".join(u.get("nearest_effects") or ())
-                said = [f"What is left in the {u['stage']} stage: {left}."] if left else []
-                said += [f"Nearest to it in the library, for the {u['stage']} stage: {near}."] if near else []
+                said = [f"What is left in the {u['stage']} subsystem: {left}."] if left else []
+                said += [f"Nearest to it in the library, for the {u['stage']} subsystem: {near}."] if near else []
                 if said:
                     ui.label(" ".join(said)).classes("note")
         command_line(s.command("diagnose"))
@@ -326,7 +328,7 @@ class _Page:
             text = f"{100 * f.probability:.0f} %: " + "; ".join(parts)
             return ". ".join(part for part in (text, capital(doubt(f)), summary) if part)
         if name in named:
-            return f"Rival of {named[name]}: this log cannot tell them apart. {summary}"
+            return f"Rival of {named[name]}: this log cannot distinguish them. {summary}"
         if c is not None and c.reason:
             return f"{capital(CANNOT)}; needs: {c.reason}"
         left = f"Alone it leaves {floors(c.left)} noise floors. " if c is not None and c.left == c.left else ""
@@ -452,9 +454,7 @@ class _Page:
 
     def _rivals(self) -> None:
         if self.s.diagnosis is None:
-            ui.label("Where this log cannot tell rivals apart: the safe demand profile that would.").classes(
-                "soft small"
-            )
+            ui.label("If this log cannot distinguish rivals: the safe demand profile that can.").classes("soft small")
         elif self._pairs():
             ui.label("Rivals: " + "; ".join(f"{a} or {b}" for a, b in self._pairs())).classes("small")
         else:

@@ -282,7 +282,7 @@ class _Page:
 
     def inject(self) -> None:
         """A button for every scenario of the library."""
-        with card("3  A bad day, on purpose"):
+        with card("3  Fault-injection scenarios"):
             find = (
                 ui.input(placeholder="find a scenario")
                 .props('outlined dense clearable aria-label="find a scenario"')
@@ -332,7 +332,7 @@ class _Page:
             ui.button(f"Judge {last}", icon="rule", on_click=lambda: self.loop.judge(last)).props(
                 "outline dense padding='2px 12px'"
             ).classes("judge")
-            ui.label("Here it begins in the loop that runs. By itself, held against what it expects:").classes("note")
+            ui.label("Here it begins in the running loop. Alone, compared with its expected reactions:").classes("note")
         command_line(shlex.join(["vaneloop", "inject", last, "--bus", self.loop.bus_name]))
 
     # ---- trace

@@ -30,7 +30,7 @@ from vaneloop.web.session import LogFile, Session
 
 __all__ = ["build"]
 
-TITLES = ("Mechanism", "Stroke for the VIGV", "Links of the other stages", "Measured loop", "Tables")
+TITLES = ("Mechanism", "Stroke for the VIGV", "Links of the other vane rows", "Measured loop", "Tables")
 
 
 @dataclass
@@ -120,8 +120,8 @@ class _Page:
         with (
             card(
                 "1  The engine",
-                "Lengths as built, the angles that each stage shall have, and a log of stroke and angle driven there "
-                "and back.",
+                "Lengths as built, the angles that each vane row shall have, and a log of stroke and angle driven "
+                "there and back.",
             ),
             ui.element("div").classes("two"),
         ):
@@ -179,7 +179,7 @@ class _Page:
         self.upload = drop(
             "Drop geometry.toml, schedules.toml or a log", self.most, suffixes(), self._uploaded, self._rejected
         )
-        options = {-1: "no log: the play entered above", **{i: f.name for i, f in enumerate(s.files)}}
+        options = {-1: "no log: the backlash entered above", **{i: f.name for i, f in enumerate(s.files)}}
         at = next((i for i, f in enumerate(s.files) if f == plan.log), -1)
 
         def chosen(e: events.ValueChangeEventArguments[Any]) -> None:
@@ -402,7 +402,7 @@ class _Page:
             Line("mean", n, t[3], "target"),
         ]
         figure_of(overlay([Panel("stroke [mm]", lines)], "rotor speed [%]"), dark(self.s), 300)
-        ui.label("Curves for the play entered: while it extends, the VIGV lags by half of it.").classes("note")
+        ui.label("Curves for the backlash entered: while it extends, the VIGV lags by half of it.").classes("note")
 
     def _links(self, r: Any) -> None:
         rows = []
@@ -413,7 +413,7 @@ class _Page:
                 figures = (f"{v:.3f}" for v in (s.at_design[name], s.rms[name], s.largest[name]))
                 rows.append([NAMES[s.stage], words, f"{lb:g}", f"{lc:g}", *figures])
         with ui.element("div").classes("half"):
-            table(["stage", "", "Lb, mm", "Lc, mm", "at 100 %, deg", "rms", "max"], rows, numbers=(2, 3, 4, 5, 6))
+            table(["vane row", "", "Lb, mm", "Lc, mm", "at 100 %, deg", "rms", "max"], rows, numbers=(2, 3, 4, 5, 6))
             lines = []
             for k, s in enumerate(r.links[1:], start=1):
                 lines += [

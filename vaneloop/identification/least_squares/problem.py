@@ -502,7 +502,7 @@ def recalibrate(judge: LeastSquaresProblem) -> Fit:
     if silent.any():
         o, i = (int(k[0]) for k in np.nonzero(silent))
         raise StageError(
-            f"stage {stage.name!r}: the model's {stage.outputs[o]} is no number at {stage.t[i]:g} s and in "
+            f"subsystem {stage.name!r}: the model's {stage.outputs[o]} is no number at {stage.t[i]:g} s and in "
             f"{int(silent.sum()):,} samples; allowed: finite values"
         )
     begins = [judge.stage.neutral(), *(judge.stage.begins if judge.stage.begins is not None else ())]

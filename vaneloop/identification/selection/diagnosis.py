@@ -35,7 +35,7 @@ Said = tuple[Search, Fit, list[Candidate], list[tuple[str, float]]]
 def floor_of(stage: Stage) -> Array:
     """The stage's noise floor, which whoever made the stage must have given."""
     if stage.floor is None or not np.all(np.isfinite(stage.floor)):
-        raise StageError(f"stage {stage.name!r}: no noise floor")
+        raise StageError(f"subsystem {stage.name!r}: no noise floor")
     return stage.floor
 
 
@@ -158,7 +158,8 @@ def _to_the_floor(
     if search.base is not search.first:
         was, now = (rms_of(search.judge, f) for f in (search.first, search.base))
         d.notes.append(
-            f"with nothing added {stage.name} comes to {now:.4g} noise floors, not {was:.4g}, from where the search led"
+            f"with nothing added {stage.name} reaches {now:.4g} noise floors, not {was:.4g}, "
+            f"from the best parameters of the search"
         )
     return d
 
@@ -270,7 +271,7 @@ def extend_stage(
     for e in effects:
         if all(e != x.name for x in stage.effects):
             raise StageError(
-                f"stage {stage.name!r} has no effect {e!r}; it has {', '.join(x.name for x in stage.effects)}"
+                f"subsystem {stage.name!r} has no effect {e!r}; it has {', '.join(x.name for x in stage.effects)}"
             )
 
     def ask(floor: Array, _: bool) -> tuple[Fit, Said]:

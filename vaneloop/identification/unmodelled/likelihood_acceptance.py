@@ -76,7 +76,7 @@ def unconfirmed(before: Mapping[str, Array], after: Mapping[str, Array], tests: 
     for log in sorted(tests & set(now)):
         nats = 0.5 * (was[log] - now[log])
         if many[log] and nats < NATS:
-            return f"{log} says so by {nats:.1f} nats only"
+            return f"{log}: log-likelihood gain of {nats:.1f} only"
     n = max(sum(many.values()), 1)
     fall = (np.sqrt(sum(was.values()) / n) - np.sqrt(sum(now.values()) / n)) * np.sqrt(2.0 * n)
-    return "" if fall > SPREADS else f"the error falls by {fall:.1f} spreads of the noise only"
+    return "" if fall > SPREADS else f"the error falls by {fall:.1f} standard deviations of its noise only"

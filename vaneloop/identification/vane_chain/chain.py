@@ -156,7 +156,7 @@ def build_chain(
                 f"state: mode RUN in {share:.0%} of the log; engine, actuator and linkage are judged in all modes"
             )
     foreign = [v for v in VANES if v in columns and v not in machine.vanes]
-    notes += [f"{v}: this machine has no such stage (geometry); not judged" for v in foreign]
+    notes += [f"{v}: this machine has no such vane row (geometry); not judged" for v in foreign]
     if room_for(machine.p) < MOST_CURVES:
         logged = {*columns, *machine.usual, "time", *(OF_STROKE if "x_lvdt" in columns else ())}
         curves = range(CURVES + 1, CURVES + 1 + CURVE_ROWS * int(machine.p[CURVES].max()), CURVE_ROWS)
@@ -230,7 +230,7 @@ def build_chain(
             absent[name] = "no " + ", ".join(missing or gives)
             continue
         if name in ("servo", "demand") and dt > 1.5 * RASTER:
-            absent[name] = f"raster of {dt:g} s; the controller works every 0.01 s"
+            absent[name] = f"sample time of {dt:g} s; the controller works every 0.01 s"
             continue
         rows = law_holds if name in ("servo", "demand") else currents if name == "actuator" else machine_rows
         driven = Driven(t, have, machine, cal, outputs, rows, present, turns=turns)

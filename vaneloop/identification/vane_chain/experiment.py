@@ -181,13 +181,13 @@ def recommend(d: Any, progress: Any = None, chain: Any = None) -> dict[str, Any]
     often = "" if repeats == 1 else f", {repeats} times over"
     gained = repeats * best["nats"]
     text = (
-        f"To tell {names}: {best['profile']}{often}, {len(profile) / 100:.0f} s; expected gain {gained:.0f} nats "
-        f"for the closest pair."
+        f"To distinguish {names}: {best['profile']}{often}, {len(profile) / 100:.0f} s; expected log-likelihood ratio "
+        f"{gained:.0f} for the closest pair."
     )
     if not separated:
         text = (
-            f"No profile of the bank separates {names}, even {MOST_REPEATS} times over: they differ by "
-            f"{best['nats']:.1f} nats a run at best, {MARGIN * NATS:g} are wanted."
+            f"No profile of the bank separates {names}, even {MOST_REPEATS} times over: the "
+            f"log-likelihood ratio is {best['nats']:.1f} a run at best, {MARGIN * NATS:g} is required."
         )
     return {
         "text": text, "profile": best["profile"], "score": gained, "separates": separated, "repeats": repeats,

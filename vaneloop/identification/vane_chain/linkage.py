@@ -88,4 +88,4 @@ def _cross_talk(named: Named) -> str:
     }
     gains = changed["pot_gain"]
     one = len(gains) == 1 and gains <= changed.get("pot_bias", set())
-    return "a share of another stage's reading" if one else ""
+    return "a share of another vane row's reading" if one else ""
