@@ -55,7 +55,7 @@ def test_samples_that_nothing_was_fitted_to_must_say_so_too(rest: float, why: st
 def test_what_is_sure_and_too_little_is_no_law() -> None:
     """Errors of form have many nats on a long log."""
     before, after = {"log": np.ones((1, N))}, {"log": 0.995 * np.ones((1, N))}
-    assert "spreads" in unconfirmed(before, after, frozenset())
+    assert "standard deviations" in unconfirmed(before, after, frozenset())
 
 
 def test_no_curve_is_larger_in_usual_than_what_moves_the_outputs_by_their_error() -> None:
