@@ -242,7 +242,7 @@ BAD: list[tuple[tuple[str, ...], tuple[str, ...]]] = [
     (("extend", "{log}", "--effect", "aero_load", "--out", "a_folder"), ("a_folder", "cannot write")),
     (("extend", "vanes_only.csv", "--effect", "aero_load", "--out", "m.toml"), ("vanes_only.csv",)),
     *(((c, "no_such.csv"), ("no_such.csv",)) for c in (*SEARCH, "compare")),
-    *(((c, "vanes_only.csv"), ("vanes_only.csv", "no stage can be judged")) for c in SEARCH),
+    *(((c, "vanes_only.csv"), ("vanes_only.csv", "no subsystem can be judged")) for c in SEARCH),
     *(((c, "short.csv"), ("short.csv", "300 samples", "at least 500")) for c in SEARCH),
     (("diagnose", "text.csv"), ("text.csv",)),
     (("diagnose", "cut.parquet"), ("cut.parquet",)),
