@@ -19,9 +19,10 @@ from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
 from vaneloop.identification.least_squares import problem as fitting
-from vaneloop.identification.least_squares.problem import DIFFERENCE, Fit, LeastSquaresProblem
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import diagnose_stage
 from vaneloop.identification.selection.search import Search
+from vaneloop.identification.settings import DIFFERENCE
 from vaneloop.identification.subsystem import Stage
 
 __all__ = ["in_scipy", "ours"]

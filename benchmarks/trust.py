@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.blind import share
-from vaneloop.identification.selection.calibration import COEFFICIENTS, terms, trust
+from vaneloop.identification.selection.calibration import terms, trust
+from vaneloop.identification.settings import TRUST_COEFFICIENTS
 
 RIDGE = 1.0  # observations that a coefficient of 0 is worth: few answers must not make a name certain
 BINS = (0.0, 0.3, 0.6, 0.8, 0.9, 0.95, 1.001)
@@ -104,7 +105,7 @@ def main() -> None:
     if len(sys.argv) < 3 or sys.argv[1] not in ("fit", "judge"):
         raise SystemExit("usage: python -m benchmarks.trust fit|judge RESULT.parquet ...")
     names = [n for f in sys.argv[2:] for n in names_of(pq.read_table(f).to_pylist())]
-    for criterion in COEFFICIENTS:
+    for criterion in TRUST_COEFFICIENTS:
         mine = [n for n in names if n.criterion == criterion]
         print(f"{criterion}: {len(mine)} names, {sum(bool(n.right) for n in mine)} with what was hidden among them")
         if not mine:

@@ -23,7 +23,8 @@ from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
 from vaneloop.base.forms import FORMS
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
-from vaneloop.identification.least_squares.residuals import FAR, normalise_residuals
+from vaneloop.identification.least_squares.residuals import normalise_residuals
+from vaneloop.identification.settings import NO_ANSWER_ERROR
 from vaneloop.identification.subsystem import Parameter, Stage, StageError
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
 from vaneloop.identification.vane_chain.parameters import FREE
@@ -68,7 +69,7 @@ def test_what_a_model_does_not_say_is_far_off_and_what_was_not_measured_counts_n
     normalise_residuals(
         model, np.zeros((1, 3)), np.array([[1.0, 1.0, 0.0]]), np.array([0.1]), np.empty(0, np.int64), out
     )
-    assert out.tolist() == [[[-5.0, FAR, 0.0]]]
+    assert out.tolist() == [[[-5.0, NO_ANSWER_ERROR, 0.0]]]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

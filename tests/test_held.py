@@ -19,9 +19,9 @@ from hil.replay import replay
 from tests.bus_logs import by_ticks, by_wire, with_effect, write_frames
 from vaneloop.base.spans import Span
 from vaneloop.cli.main import main
-from vaneloop.identification.regimes import AGREES
 from vaneloop.identification.results import StageDiagnosis
 from vaneloop.identification.selection.diagnosis import diagnose_stage
+from vaneloop.identification.settings import AGREES
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
 from vaneloop.identification.vane_chain.resample import grid_of, on_raster, rms
 from vaneloop.verbs.parts import part_of

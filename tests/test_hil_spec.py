@@ -25,7 +25,7 @@ from plant import build_plant
 from plant.parameters import PLAY
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
-from vaneloop.identification.regimes import AGREES
+from vaneloop.identification.settings import AGREES
 
 SHIPPED, flashed = build_plant(), cache(load_calibration)
 

@@ -587,9 +587,9 @@ def test_a_stage_that_cannot_be_used_says_why(make: Callable[[], object], says: 
 
 def in_pieces(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> tuple[Stage, list[int]]:
     """A stage that is searched on a third of its samples, and a list that notes how many the search saw."""
-    monkeypatch.setattr("vaneloop.identification.selection.diagnosis.LONG", N)
-    monkeypatch.setattr("vaneloop.identification.selection.diagnosis.SEARCHED", N // 3)
-    monkeypatch.setattr("vaneloop.identification.selection.diagnosis.PIECE", 400)
+    monkeypatch.setattr("vaneloop.identification.selection.diagnosis.LONG_SAMPLES", N)
+    monkeypatch.setattr("vaneloop.identification.selection.diagnosis.EXCERPT_SAMPLES", N // 3)
+    monkeypatch.setattr("vaneloop.identification.selection.diagnosis.EXCERPT_PIECE", 400)
     seen: list[int] = []
 
     def excerpt(at: np.ndarray) -> Stage:

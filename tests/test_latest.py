@@ -20,7 +20,7 @@ def test_a_set_that_was_simulated_is_not_simulated_again(monkeypatch):
         asked.append(thetas[:, 0].tolist())
         return np.repeat(thetas[:, :1, None], 5, axis=2)
 
-    monkeypatch.setattr(latest, "VALUES", 15)  # three sets
+    monkeypatch.setattr(latest, "KEPT_ERRORS", 15)  # three sets
     kept = latest.ResidualCache()
 
     def errors(*sets: float) -> None:

@@ -15,11 +15,12 @@ from vaneloop import Record, System, unknown
 from vaneloop.base.forms import FORMS
 from vaneloop.identification.candidates.closed_forms import begin
 from vaneloop.identification.candidates.library import FORCE_LAWS
+from vaneloop.identification.settings import NO_TURN, OTHER_AMPLITUDE
 from vaneloop.identification.unmodelled import confirmation as confirmed
-from vaneloop.identification.unmodelled.confirmation import OTHER, moves, stands_before
+from vaneloop.identification.unmodelled.confirmation import moves, stands_before
 from vaneloop.identification.unmodelled.learning import CurveSearch
 from vaneloop.identification.unmodelled.parametric_preference import earning_by_formula
-from vaneloop.identification.user_models.hysteresis_regressors import NO_TURN, swings
+from vaneloop.identification.user_models.hysteresis_regressors import swings
 
 T = np.linspace(0.0, 28.0, 5601)  # s
 
@@ -46,8 +47,8 @@ def test_parts_of_one_sine_are_no_other_amplitude() -> None:
     far = moved(np.sin(2.0 * np.pi * 0.25 * T), 24)
     ways = [np.ptp(part) for part in np.array_split(np.sin(2.0 * np.pi * 0.25 * T), 24)]
     large = np.array(ways) > np.median(ways)
-    assert np.median(np.array(ways)[large]) > OTHER * np.median(np.array(ways)[~large])
-    assert far.max() < OTHER * far.min()
+    assert np.median(np.array(ways)[large]) > OTHER_AMPLITUDE * np.median(np.array(ways)[~large])
+    assert far.max() < OTHER_AMPLITUDE * far.min()
 
 
 def test_a_sine_of_two_amplitudes_has_two() -> None:

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from vaneloop import Record, System, unknown
+from vaneloop.identification.settings import BENDS_TRIED, FINE_SPLINES, LAG_TIMES
 from vaneloop.identification.unmodelled.curve_candidates import Candidate, UserModelCandidates
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
-from vaneloop.identification.unmodelled.learning import SPLINES, TIMES, WIGGLES, CurveSearch
+from vaneloop.identification.unmodelled.learning import CurveSearch
 from vaneloop.identification.unmodelled.screening import smoothed
 from vaneloop.identification.user_models.by_log import bind
 from vaneloop.identification.user_models.hysteresis_regressors import lagged, named_lag
@@ -57,8 +58,8 @@ def test_the_time_of_a_creep_is_found(share: float, tau: float) -> None:
     """A share of the way comes late; the gain is fitted beside it."""
     learner = learner_of(lambda q: share * q, tau, seed=int(10 * tau), gain=2.0 - share)
     current, c = late(learner)
-    begun = smoothed(learner, current, c, np.append(learner.base.theta, np.zeros(len(c.parts))), WIGGLES)
-    best = learner._with_its_lag(current, begun, TIMES)
+    begun = smoothed(learner, current, c, np.append(learner.base.theta, np.zeros(len(c.parts))), BENDS_TRIED)
+    best = learner._with_its_lag(current, begun, LAG_TIMES)
     assert tau_of(best.candidate) == pytest.approx(tau, rel=0.1)
 
 
@@ -72,9 +73,9 @@ def test_a_curve_of_many_splines_finds_its_lag_too(tau: float, begun: float) -> 
     coarse = learner.fitted(current, c, 1.0, np.append(learner.base.theta, np.zeros(len(c.parts))), 12)
     fine = learner._finer(current, coarse)
     assert fine is not None and len(fine.candidate.basis.bend) > len(c.basis.bend)
-    best = learner._with_its_lag(current, fine, TIMES[1:])
+    best = learner._with_its_lag(current, fine, LAG_TIMES[1:])
     assert tau_of(best.candidate) == pytest.approx(tau, rel=0.1)
-    assert best.candidate.splines == SPLINES and len(best.candidate.parts) == len(fine.candidate.parts)
+    assert best.candidate.splines == FINE_SPLINES and len(best.candidate.parts) == len(fine.candidate.parts)
 
 
 def test_a_curve_is_carried_from_end_to_end_whatever_its_splines() -> None:
@@ -83,10 +84,10 @@ def test_a_curve_is_carried_from_end_to_end_whatever_its_splines() -> None:
     amplitudes = np.random.default_rng(0).standard_normal(len(c.parts)) / np.sqrt(1.0 + c.basis.bend)
     curve = c.basis.design(c.grid) @ (c.turn @ amplitudes)
     assert c.as_of(c, amplitudes) == pytest.approx(amplitudes, abs=1e-6)
-    fine = c.finer(SPLINES)
+    fine = c.finer(FINE_SPLINES)
     assert fine is not None and c.finer(len(c.basis.bend)) is None
     longer = fine.slower(1.3)
-    assert longer is not None and longer.splines == SPLINES
+    assert longer is not None and longer.splines == FINE_SPLINES
     for one in (fine, longer):
         own = one.basis.design(one.grid) @ (one.turn @ one.as_of(c, amplitudes))
         assert own == pytest.approx(curve, abs=0.05 * np.ptp(curve))

@@ -9,9 +9,9 @@ import pytest
 
 from tests.test_learn_vanes import chain
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
-from vaneloop.identification.selection.likelihood_acceptance import NATS, RIVAL_NATS
-from vaneloop.identification.selection.relative_error_acceptance import PER_PARAMETER, RIVAL, score
-from vaneloop.identification.unmodelled.closed_form_fits import CLOSE, REFITTED, _nearest
+from vaneloop.identification.selection.relative_error_acceptance import score
+from vaneloop.identification.settings import FORMS_ALIKE, FORMS_REFITTED, NATS, PER_PARAMETER, RIVAL, RIVAL_NATS
+from vaneloop.identification.unmodelled.closed_form_fits import _nearest
 from vaneloop.identification.unmodelled.likelihood_acceptance import above_the_noise, earns, grain_of, unconfirmed
 from vaneloop.identification.vane_chain.candidates import VaneChainCandidates, remade
 
@@ -79,7 +79,7 @@ def test_a_corner_that_splines_round_is_told_where_they_are_off_everywhere_alike
     rounded = -0.05 * np.where(np.abs(x) < 1.0, 0.5 + 0.5 * x**2, np.abs(x)) - 0.018 * x
     variance = (1e-4 + 0.03 * np.abs(x)) ** 2
     told, alike = (
-        [form.name for form, _ in _nearest(c, x, rounded, variance, {0, 1}, weight)][:REFITTED]
-        for weight in (1.0 / np.sqrt(variance + CLOSE * np.var(rounded)), np.ones(len(x)))
+        [form.name for form, _ in _nearest(c, x, rounded, variance, {0, 1}, weight)][:FORMS_REFITTED]
+        for weight in (1.0 / np.sqrt(variance + FORMS_ALIKE * np.var(rounded)), np.ones(len(x)))
     )
     assert "magnitude" in alike and "magnitude" not in told

@@ -12,13 +12,13 @@ import pytest
 from hil.logs import Channel, Log
 from tests import rig
 from tests.firmware_on_rig import firmware
-from vaneloop.identification.selection.likelihood_acceptance import RIVAL_NATS, correlation_of
+from vaneloop.identification.selection.likelihood_acceptance import correlation_of
+from vaneloop.identification.settings import RIVAL_NATS, SCREENED_BEND
 from vaneloop.identification.unmodelled import parametric_preference as by_formula
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
 from vaneloop.identification.unmodelled.learning import CurveSearch
 from vaneloop.identification.unmodelled.parametric_preference import said_first
-from vaneloop.identification.unmodelled.screening import SCREENED
 from vaneloop.identification.vane_chain.candidates import VaneChainCandidates, remade
 from vaneloop.identification.vane_chain.chain import build_chain
 
@@ -47,7 +47,7 @@ def with_load(force: float) -> tuple[CurveSearch, FittedCandidate, list[FittedCa
     before = FittedCandidate(learner.candidates[0], 0.0, learner.judge, learner.base, ())
     begin = [np.append(learner.base.theta, np.zeros(len(c.parts))) for c in learner.candidates]
     both = zip(learner.candidates, begin, strict=True)
-    return learner, before, [learner.fitted(before, c, SCREENED, theta, 12) for c, theta in both]
+    return learner, before, [learner.fitted(before, c, SCREENED_BEND, theta, 12) for c, theta in both]
 
 
 @pytest.mark.slow

@@ -27,7 +27,8 @@ from vaneloop.base.durations import in_name, of_name, period_of, within_no_perio
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import read
 from vaneloop.identification import StageError
-from vaneloop.identification.candidates.spline_basis import FINE_HARMONICS, waves_of
+from vaneloop.identification.candidates.spline_basis import waves_of
+from vaneloop.identification.settings import FINE_HARMONICS
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
 from vaneloop.identification.unmodelled.learning import CurveSearch
 from vaneloop.identification.unmodelled.spectral_lines import Course, Lines

@@ -13,10 +13,11 @@ import pytest
 from tests.test_learn_vanes import rig_chain
 from vaneloop import Record, System, unknown
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
-from vaneloop.identification.selection.subsampled_search import LITTLE, excerpt_of
+from vaneloop.identification.selection.subsampled_search import excerpt_of
+from vaneloop.identification.settings import CURVES_QUICK, LAG_TIMES, LITTLE_TOLD
 from vaneloop.identification.unmodelled.curve_candidates import Candidate, UserModelCandidates
 from vaneloop.identification.unmodelled.fitted_candidate import CandidateSource, FittedCandidate
-from vaneloop.identification.unmodelled.learning import QUICK, TIMES, CurveSearch
+from vaneloop.identification.unmodelled.learning import CurveSearch
 from vaneloop.identification.unmodelled.parametric_preference import leaves
 from vaneloop.identification.unmodelled.screening import screened
 from vaneloop.identification.user_models.by_log import bind
@@ -66,10 +67,10 @@ def test_what_goes_with_one_over_a_parameter_is_among_what_is_fitted(outflow: tu
     """Four times the outflow is a quarter of the level: no step by slopes shows it, and sums of the oil seemed more."""
     learner = learner_of(outflow, seed)
     current = FittedCandidate(learner.candidates[0], 0.0, learner.judge, learner.base, ())
-    bare, promising = screened(learner, current, QUICK, TIMES[0])
+    bare, promising = screened(learner, current, CURVES_QUICK, LAG_TIMES[0])
     names, left = [c.name for _, c, _ in promising], [cost for cost, *_ in promising]
     assert left == sorted(left) and left[0] < 0.05 * bare
-    assert len(set(names)) == len(names) >= QUICK
+    assert len(set(names)) == len(names) >= CURVES_QUICK
     assert {(c.how, c.at) for _, c, _ in promising} == {(c.how, c.at) for c in learner.candidates}
     assert "outflow.gain_of_oil" in names
     best = learner._finalists(current)[0]
@@ -96,7 +97,7 @@ def test_pieces_that_stand_are_not_searched() -> None:
     assert np.isfinite(part.measured[0]).sum() > 0.5 * len(at)
     counts = [int(stage.counted(np.arange(k, k + 1_000)).sum()) for k in range(0, 23_000, 1_000)]
     chosen = sorted({int(k) // 1_000 for k in at})
-    assert all(counts[k] >= LITTLE * max(counts) for k in chosen)
+    assert all(counts[k] >= LITTLE_TOLD * max(counts) for k in chosen)
 
 
 @pytest.mark.slow

@@ -66,7 +66,7 @@ def test_a_fit_by_carried_slopes_ends_where_one_by_simulated_ones_does(monkeypat
     """From slopes near the start, with fewer simulations; in any unit."""
     ends, many = [], []
     for limit, unit in ((400_000, 1.0), (0, 1.0), (400_000, 1e6)):
-        monkeypatch.setattr(steps, "CARRIED", limit)
+        monkeypatch.setattr(steps, "CARRIED_VALUES", limit)
         asked: list[int] = []
         judge = LeastSquaresProblem(bent_stage(asked, 0.2, unit), np.array([1e-3]))
         start = np.array([0.3, 0.5 / unit])

@@ -44,7 +44,7 @@ def test_sets_in_two_threads_are_those_run_one_by_one(monkeypatch: pytest.Monkey
     monkeypatch.setattr(runner, "threads", lambda: 1)
     alone = stage.run(sets)
     monkeypatch.setattr(runner, "threads", lambda: 2)
-    monkeypatch.setattr(runner, "SHORT", 0)
+    monkeypatch.setattr(runner, "SHORT_RUN", 0)
     assert np.array_equal(stage.run(sets), alone)
     assert not np.array_equal(alone[0], alone[1])
 

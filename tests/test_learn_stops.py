@@ -26,10 +26,11 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.hysteresis import RADII, slipped, weights_of
 from vaneloop.cli.main import main
 from vaneloop.identification.results import rms_of
+from vaneloop.identification.settings import BEFORE_LOG
 from vaneloop.identification.unmodelled.confirmation import another_confirms
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
 from vaneloop.identification.unmodelled.learning import CurveSearch
-from vaneloop.identification.user_models.hysteresis_regressors import BEFORE, forgotten, of_stops
+from vaneloop.identification.user_models.hysteresis_regressors import forgotten, of_stops
 from vaneloop.identification.vane_chain.candidates import LAGGED, SLIPS, VaneChainCandidates, with_laws
 from vaneloop.identification.vane_chain.chain import build_chain
 from vaneloop.identification.vane_chain.subsystem_data import Made
@@ -99,7 +100,7 @@ def test_where_a_hysteresis_has_forgotten_what_was_before_the_log_it_is_what_it_
     known, rest = forgotten(log, 8.0, table), of_stops(log, 0.0, 8.0, table)
     after = of_stops(whole, 0.0, 8.0, table)[-len(log) :]
     assert known.any() or np.ptp(log) < 16.0
-    assert np.all(np.abs(after - rest)[known] < 2.0 * BEFORE * np.max(np.abs(table)) + 0.01)
+    assert np.all(np.abs(after - rest)[known] < 2.0 * BEFORE_LOG * np.max(np.abs(table)) + 0.01)
 
 
 def test_a_channel_that_has_hardly_moved_is_sure_of_nothing_and_one_that_went_everywhere_of_all_after_it() -> None:

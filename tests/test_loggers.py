@@ -12,8 +12,8 @@ import pytest
 from hil.logs import Channel, Log
 from tests import rig
 from tests.firmware_on_rig import firmware
+from vaneloop.identification.settings import SETTLE
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
-from vaneloop.identification.vane_chain.resample import SETTLE
 from vaneloop.identification.workflow import diagnose
 
 DURATION = 120.0  # s

@@ -11,8 +11,9 @@ import pytest
 from hil.logs import Channel, Log
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
-from vaneloop.identification.chunked_residuals import BLOCKS, Failing, Sums, failing, joined, of_whole
+from vaneloop.identification.chunked_residuals import Failing, Sums, failing, joined, of_whole
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.settings import PIECE_BLOCKS
 from vaneloop.identification.vane_chain.candidates import remade
 from vaneloop.identification.vane_chain.resample import Grid, grid_of, on_raster
 from vaneloop.identification.workflow import diagnose
@@ -134,7 +135,7 @@ def test_an_excerpt_has_been_wherever_the_log_has_been() -> None:
 
 def noise(pieces: int, seed: int = 0) -> Sums:
     """A stage at its noise floor with both of two parameter sets."""
-    n = np.full((1, pieces * BLOCKS), 1_000.0)
+    n = np.full((1, pieces * PIECE_BLOCKS), 1_000.0)
     squares = np.random.default_rng(seed).chisquare(1_000.0, (2, *n.shape))
     return Sums("actuator", ("x_lvdt",), ("mm",), np.array([0.005]), 0, n, n.copy(), squares, False)
 

@@ -110,6 +110,13 @@ def test_a_type_is_no_number(tmp_path: Path) -> None:
     assert [m.becomes for m in mutants_of(tmp_path, "typed.py")] == ["SIZE = 4"]
 
 
+def test_a_threshold_is_named_without_what_is_said_of_it(tmp_path: Path) -> None:
+    (tmp_path / "record.py").write_text("LIMIT = setting(4.0, 'mm', 'It ends here.', 'numerics: 2 bits')\n")
+    assert [(m.was, m.becomes) for m in mutants_of(tmp_path, "record.py")] == [
+        ("LIMIT = 4.0", "LIMIT = 3.2"), ("LIMIT = 4.0", "LIMIT = 5.0"),
+    ]  # fmt: skip
+
+
 def test_what_runs_compiled_stays_as_it_is_and_so_do_the_numbers_that_it_reads(tmp_path: Path) -> None:
     for package in ("controller", "hil"):
         (tmp_path / package).mkdir()

@@ -23,6 +23,7 @@ from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
 from vaneloop.cli.main import main
 from vaneloop.identification import regimes as core
+from vaneloop.identification import settings
 from vaneloop.identification.selection.diagnosis import diagnose_stage, extend_stage
 from vaneloop.identification.vane_chain import current
 from vaneloop.identification.vane_chain import current as stroke
@@ -185,7 +186,7 @@ def test_a_cell_of_a_failure_map_has_its_values_and_its_moment(said: dict[str, A
 
 def test_agrees_is_one_number() -> None:
     """Two packages that may not import each other have it; nobody else writes one."""
-    assert figures.AGREES == core.AGREES
+    assert figures.AGREES == settings.AGREES
     assert core.agrees(1.1, 1.0) and not core.agrees(1.1001, 1.0)
     own = re.compile(r"(ratio|excess|rms\([a-z_]+\)|error_after|\.rms)\b[^\n]{0,40}(<=?|>=?) ?1\.[0-3]\d?\b")
     files = [p for top in ("hil", "vaneloop") for p in (ROOT / top).rglob("*.py")]
@@ -269,12 +270,12 @@ def test_a_stroke_at_rest_after_gross_motion_has_finite_errors() -> None:
 def test_a_stroke_s_steps_are_calibrated_by_least_squares_of_all_whole_rows() -> None:
     """However many pieces the rows are taken in, of which the last is short and one has no whole row."""
     draw = np.random.default_rng(5)
-    n = 2 * stroke.PIECE + 7
+    n = 2 * settings.TRIANGLE_ROWS + 7
     step, logged, whole = draw.standard_normal(n), draw.standard_normal(n), draw.random(n) > 0.1
-    whole[: stroke.PIECE] = False
-    bends = [0.0, *np.quantile(np.abs(step), stroke.BENDS)]
+    whole[: settings.TRIANGLE_ROWS] = False
+    bends = [0.0, *np.quantile(np.abs(step), settings.FLOW_BENDS)]
     sides = [np.maximum(sign * step - bend, 0.0) for sign in (1.0, -1.0) for bend in bends]
-    late = [lfilter([a], [1.0, a - 1.0], step) for a in (1.0 - np.exp(-0.01 / lag) for lag in stroke.LAGS)]
+    late = [lfilter([a], [1.0, a - 1.0], step) for a in (1.0 - np.exp(-0.01 / lag) for lag in settings.CURRENT_LAGS)]
     parts = np.column_stack([*(np.roll(side, k) for side in sides for k in (-1, 0, 1)), *late, np.ones(n)])
     best = np.linalg.lstsq(parts[whole], logged[whole])[0]
     assert np.allclose(stroke._calibrated(step, 0.01, logged, whole), parts @ best, atol=1e-9)

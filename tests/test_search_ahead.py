@@ -35,8 +35,8 @@ AHEAD = 3_000  # samples of the excerpt
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vaneloop.identification.selection.subsampled_search.AHEAD", AHEAD)
-    monkeypatch.setattr("vaneloop.identification.selection.subsampled_search.PIECE", 300)
+    monkeypatch.setattr("vaneloop.identification.selection.subsampled_search.AHEAD_SAMPLES", AHEAD)
+    monkeypatch.setattr("vaneloop.identification.selection.subsampled_search.SHORT_PIECE", 300)
 
 
 def with_excerpts(stage: Stage, sets: dict[int, int] | None = None) -> Stage:

@@ -20,12 +20,11 @@ from scipy.stats import norm
 from tests.conftest import ROOT
 from vaneloop.identification import regimes as locate
 from vaneloop.identification import results as stage_answer
-from vaneloop.identification import workflow
+from vaneloop.identification import settings, workflow
 from vaneloop.identification.least_squares import problem as fit
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.selection import diagnosis as diagnose
 from vaneloop.identification.selection import likelihood_acceptance as noise_floor
-from vaneloop.identification.selection import relative_error_acceptance as error_share
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
 from vaneloop.identification.selection.search import Search
 from vaneloop.identification.subsystem import Effect, Parameter, Stage
@@ -46,9 +45,9 @@ def test_the_page_documents_the_numbers_that_are_in_force():
         for name, value in zip(re.findall(r"`([A-Z_]+)`", names), values.split(", "), strict=True):
             found.setdefault(name, set()).add(float(value))
     for name, value in DOCUMENTED.items():
-        assert found[name] == {value} and getattr(noise_floor, name) == value, name
+        assert found[name] == {value} and getattr(settings, name) == value, name
     for name, values in found.items():
-        assert values == {getattr(noise_floor if hasattr(noise_floor, name) else error_share, name)}, name
+        assert values == {getattr(settings, name)}, name
 
 
 # ---- made-up errors --------------------------------------------------------------------------------------------------
@@ -268,7 +267,7 @@ def test_the_three_leading_sets_are_finished() -> None:
 def test_a_stage_of_sixty_thousand_samples_is_searched_on_forty_thousand_in_pieces_of_four(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert (diagnose.LONG, diagnose.SEARCHED, diagnose.PIECE) == (60_000, 40_000, 4_000)
+    assert (settings.LONG_SAMPLES, settings.EXCERPT_SAMPLES, settings.EXCERPT_PIECE) == (60_000, 40_000, 4_000)
     seen = []
     monkeypatch.setattr(
         diagnose, "_to_the_floor", lambda stage, *_: seen.append(len(stage.t)) or SimpleNamespace(verdict="unknown")

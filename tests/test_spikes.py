@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from tests.conftest import examples
 from tests.test_your_own_model import drained, tank_of
-from vaneloop.identification.user_models.data import LONGEST, spikes
+from vaneloop.identification.settings import LONGEST_SPIKE
+from vaneloop.identification.user_models.data import spikes
 from vaneloop.verbs.search import diagnose
 
 T = np.arange(0.0, 60.0, 0.05)
@@ -22,8 +23,8 @@ def smooth(seed: int) -> np.ndarray:
 
 
 @settings(max_examples=examples(60), deadline=None)
-@given(seed=st.integers(0, 10_000), size=st.sampled_from([-1e9, -30.0, 30.0, 1e9]), run=st.integers(1, LONGEST),
-       at=st.integers(2, len(T) - LONGEST - 3), noise=st.sampled_from([0.0, 0.02, 0.3]))  # fmt: skip
+@given(seed=st.integers(0, 10_000), size=st.sampled_from([-1e9, -30.0, 30.0, 1e9]), run=st.integers(1, LONGEST_SPIKE),
+       at=st.integers(2, len(T) - LONGEST_SPIKE - 3), noise=st.sampled_from([0.0, 0.02, 0.3]))  # fmt: skip
 def test_a_jump_away_and_back_is_found_and_nothing_else(
     seed: int, size: float, run: int, at: int, noise: float
 ) -> None:

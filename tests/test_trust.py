@@ -8,13 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.trust import Name, fitted, judged, names_of
+from vaneloop.identification import settings
 from vaneloop.identification.selection import calibration as module
-from vaneloop.identification.selection.calibration import COEFFICIENTS, trust
+from vaneloop.identification.selection.calibration import trust
+from vaneloop.identification.settings import TRUST_COEFFICIENTS
 
 LEFT, FALL, SHARE = st.floats(0.5, 1e4), st.floats(0.5, 1e4), st.floats(0.0, 1.0)
 
 
-@given(st.sampled_from(sorted(COEFFICIENTS)), LEFT, LEFT, FALL, FALL, SHARE, SHARE)
+@given(st.sampled_from(sorted(TRUST_COEFFICIENTS)), LEFT, LEFT, FALL, FALL, SHARE, SHARE)
 def test_what_leaves_more_does_less_or_is_rivalled_is_never_trusted_more(criterion, l1, l2, f1, f2, s1, s2) -> None:
     better = {"left": min(l1, l2), "fall": max(f1, f2), "share": max(s1, s2)}
     worse = {"left": max(l1, l2), "fall": min(f1, f2), "share": min(s1, s2)}
@@ -37,12 +39,12 @@ def test_coefficients_that_made_the_answers_are_found_and_judged_right(monkeypat
     truth = (2.0, -1.5, 0.8, 1.0)
     found = fitted(drawn(4000, 1, truth))
     assert np.allclose(found, truth, atol=0.35)
-    monkeypatch.setitem(module.COEFFICIENTS, "error_share", found)
+    monkeypatch.setitem(settings.TRUST_COEFFICIENTS, "error_share", found)
     table, brier, size, covered = judged(drawn(2000, 2, truth))
     for _, mean, _, interval in table:
         low, high = (float(v) for v in interval.split(" to "))
         assert low - 0.05 <= float(mean) <= high + 0.05
-    monkeypatch.setitem(module.COEFFICIENTS, "error_share", (9.0, 0.0, 0.0, 0.0))  # always sure
+    monkeypatch.setitem(settings.TRUST_COEFFICIENTS, "error_share", (9.0, 0.0, 0.0, 0.0))  # always sure
     assert judged(drawn(2000, 2, truth))[1] > brier
     assert 1.0 <= size <= 2.0 and covered["share"] > 0.85
 

@@ -18,7 +18,8 @@ from plant.model import Learned as Table
 from vaneloop.base.errors import InputError
 from vaneloop.base.spans import Span
 from vaneloop.identification import Record, StageError, System
-from vaneloop.identification.chunked_residuals import BLOCKS, Failing, Sums
+from vaneloop.identification.chunked_residuals import Failing, Sums
+from vaneloop.identification.settings import PIECE_BLOCKS
 from vaneloop.identification.subsystem import Effect, Parameter, Stage
 from vaneloop.identification.unmodelled.fitted_candidate import Outcome
 from vaneloop.verbs import learn, long, parts, search
@@ -297,10 +298,10 @@ def test_an_excerpt_has_half_its_pieces_evenly(monkeypatch: pytest.MonkeyPatch) 
 
 def sums(name: str, hot: Sequence[int], pieces: int, first: int = 0, outputs: tuple[str, ...] = ("y",)) -> Sums:
     """Sums of a stage whose last parameter set fails in the ``hot`` pieces."""
-    n = np.full((len(outputs), pieces * BLOCKS), 100.0)
+    n = np.full((len(outputs), pieces * PIECE_BLOCKS), 100.0)
     squares = np.repeat(n[None], 2, axis=0).copy()
     for piece in hot:
-        squares[1, 0, piece * BLOCKS : (piece + 1) * BLOCKS] = 900.0 + 100.0 * piece
+        squares[1, 0, piece * PIECE_BLOCKS : (piece + 1) * PIECE_BLOCKS] = 900.0 + 100.0 * piece
     return Sums(name, outputs, ("mm",) * len(outputs), np.full(len(outputs), 0.5), first, n, n.copy(), squares, False)
 
 
@@ -315,7 +316,10 @@ def test_a_log_is_held_stretch_by_stretch_and_what_fails_told_by_its_time(monkey
         assert fits["a"][0].tolist() == [[1.0], [2.0]] and fits["a"][1].tolist() == [0.5]
         here = long.STRETCH if k < 2 else 4
         hot = {0: [2, 3, 7], 2: [1]}.get(k, [])
-        return [sums("a", hot, here, k * long.STRETCH * BLOCKS), sums("b", [], here, k * long.STRETCH * BLOCKS)]
+        return [
+            sums("a", hot, here, k * long.STRETCH * PIECE_BLOCKS),
+            sums("b", [], here, k * long.STRETCH * PIECE_BLOCKS),
+        ]
 
     looked: list[tuple[float, int]] = []
     judged = long.failing

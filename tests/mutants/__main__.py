@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import json
 import os
 import sys
@@ -10,14 +11,49 @@ import tempfile
 import time
 import tomllib
 from collections import Counter
+from fnmatch import fnmatch
 from pathlib import Path
 
-from .campaign import ROOT, Outcome, Target, run_target, sample
+from vaneloop.identification import settings
+
+from .campaign import ROOT, SETTINGS, Outcome, Target, run_target, sample
 from .mutate import Mutant, mutants_of
 
 ENOUGH = 0.90  # of the mutants that are not equivalent
 STRICT = 0.95  # where a wrong answer is sent or believed: firmware, wire, calibration, diagnosis, search
 FIRMWARE = ("firmware", "modes", "monitors", "records", "schedule", "servo", "strategies", "trend")
+# The rooms of the identification, and the headings of its thresholds that their tests hold.
+HEADINGS = {
+    "vaneloop.identification": ("Least squares", "Noise", "Candidates", "Selection", "Regimes"),
+    "vaneloop.identification.user_models": ("Unmodelled terms", "User models"),
+    "vaneloop.identification.vane_chain": ("Vane chain",),
+}
+SEARCH = tuple(
+    f"vaneloop/identification/{f}.py"
+    for f in (
+        "least_squares/levenberg_marquardt", "selection/diagnosis", "least_squares/problem",
+        "selection/likelihood_acceptance", "selection/search", "workflow", "regimes",
+    )
+)  # fmt: skip
+
+
+def read_by(files: tuple[str, ...]) -> tuple[str, ...]:
+    """Thresholds of the identification that these files import."""
+    lines = [s for f in files for s in ast.parse((ROOT / f).read_text()).body if isinstance(s, ast.ImportFrom)]
+    return tuple(sorted({a.name for s in lines if s.module == settings.__name__ for a in s.names}))
+
+
+def under(package: str) -> tuple[str, ...]:
+    """Thresholds of the identification that the tests of a package hold."""
+    return tuple(n for n, s in settings.RECORD.items() if s.heading in HEADINGS.get(package, ()))
+
+
+def files_of(package: str) -> tuple[str, ...]:
+    """A package's own files, and the record of thresholds where its tests hold some."""
+    own = f"{package.replace('.', '/')}/*.py"
+    return (own, SETTINGS) if under(package) and not fnmatch(SETTINGS, own) else (own,)
+
+
 TARGETS: tuple[Target, ...] = (
     Target(
         "firmware",
@@ -53,15 +89,7 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target(
         "search",
-        (
-            "vaneloop/identification/least_squares/levenberg_marquardt.py",
-            "vaneloop/identification/selection/diagnosis.py",
-            "vaneloop/identification/least_squares/problem.py",
-            "vaneloop/identification/selection/likelihood_acceptance.py",
-            "vaneloop/identification/selection/search.py",
-            "vaneloop/identification/workflow.py",
-            "vaneloop/identification/regimes.py",
-        ),
+        (*SEARCH, SETTINGS),
         (
             "tests/test_search_limits.py",
             "tests/test_descent.py",
@@ -71,6 +99,7 @@ TARGETS: tuple[Target, ...] = (
         ),
         functions=False,
         enough=STRICT,
+        thresholds=read_by(SEARCH),
     ),
 )
 CORE = (
@@ -141,10 +170,11 @@ STRICTLY = ("controller", "hil.bus", "hil.calibrate", "hil.uds", *CORE)
 TARGETS += tuple(
     Target(
         package,
-        (f"{package.replace('.', '/')}/*.py",),
+        files_of(package),
         tuple(f"tests/test_{name}.py" for name in tests.split()),
         compiled=True,
         enough=STRICT if package in STRICTLY else ENOUGH,
+        thresholds=under(package),
     )
     for package, tests in NEAREST.items()
 )
@@ -162,10 +192,11 @@ KERNELS = {
 TARGETS += tuple(
     Target(
         f"{package}.kernels",
-        (f"{package.replace('.', '/')}/*.py",),
+        files_of(package),
         tuple(f"tests/test_{name}.py" for name in tests.split()),
         kernels=True,
         enough=STRICT if package in STRICTLY else ENOUGH,
+        thresholds=under(package),
     )
     for package, tests in KERNELS.items()
 )

@@ -73,6 +73,7 @@ class Target:
     compiled    the code runs compiled, so what numba compiles stays as it is
     kernels     it does not, and nothing else is changed
     enough      share of the mutants that the tests should kill
+    thresholds  the names of those in the record of the identification's that are changed
     """
 
     name: str
@@ -86,6 +87,7 @@ class Target:
     kernels: bool = False
     enough: float = 0.9
     but: tuple[str, ...] = ()
+    thresholds: tuple[str, ...] = ()
 
     def paths(self) -> list[str]:
         """Every file, relative to the root."""
@@ -98,7 +100,8 @@ class Target:
     def mutants(self) -> list[Mutant]:
         """Every mutant of the files."""
         of = {n: getattr(self, n) for n in ("functions", "constants", "only", "compiled", "kernels")}
-        return [m for f in self.paths() for m in mutants_of(ROOT, f, **of)]
+        found = [m for f in self.paths() for m in mutants_of(ROOT, f, **of)]
+        return [m for m in found if m.file != SETTINGS or m.kind != MODULE or set(m.names) <= set(self.thresholds)]
 
     def digest(self) -> str:
         """Digest of all that decides which test runs which line."""
@@ -110,6 +113,7 @@ class Target:
         return h.hexdigest()
 
 
+SETTINGS = "vaneloop/identification/settings.py"
 SOURCES = {".py", ".toml", ".dbc", ".c", ".h", ".js", ".css"}
 
 

@@ -11,14 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
-from vaneloop.identification.regimes import AGREES, stands_out
+from vaneloop.identification.regimes import stands_out
 from vaneloop.identification.results import StageDiagnosis
-from vaneloop.identification.selection.likelihood_acceptance import EXPLAINED, leaves_too_much
-from vaneloop.identification.subsystem import FLOOR_KNOWN, KNOWN_TO, Array, Stage
+from vaneloop.identification.selection.likelihood_acceptance import leaves_too_much
+from vaneloop.identification.settings import AGREES, EXPLAINED, FLOOR_KNOWN, NOISE_KNOWN_TO, PIECE_BLOCKS
+from vaneloop.identification.subsystem import Array, Stage
 
-__all__ = ["BLOCKS", "Failing", "Sums", "failing", "joined", "of_whole", "sums_of"]
-
-BLOCKS = 6  # of a piece: a piece fails only if it does so without its worst blocks, too
+__all__ = ["Failing", "Sums", "failing", "joined", "of_whole", "sums_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,14 +111,14 @@ class Failing:
 
 
 def failing(sums: Sums, level: float, looks: int) -> tuple[Array, Array]:
-    """Pieces, of `BLOCKS` blocks each, in which a stage with the last parameter set fails; and the error of each piece
-    in noise floors: both [outputs, pieces].
+    """Pieces, of `PIECE_BLOCKS` blocks each, in which a stage with the last parameter set fails; and the error of each
+    piece in noise floors: both [outputs, pieces].
 
     level  mean square error of the last parameter set where it was fitted, in squared noise floors: what it leaves
            everywhere is no matter of one piece
     looks  pieces of all outputs that are looked at, as of `stands_out`
     """
-    known = max(1.0, level) * ((1.0 + KNOWN_TO) ** 2 if sums.uneven else 1.0)
+    known = max(1.0, level) * ((1.0 + NOISE_KNOWN_TO) ** 2 if sums.uneven else 1.0)
     hot, ratio = [], []
     for k in range(len(sums.outputs)):
         n, square, floor = (_pieces(v[k]) for v in (sums.samples, sums.squares[-1], sums.expected))
@@ -145,7 +144,7 @@ def _in_one(n: Array, square: Array, floor: Array) -> tuple[Array, Array, Array]
 
 def _pieces(blocks: Array) -> Array:
     """Blocks as pieces: float64[pieces, BLOCKS]; what lacks to a whole piece is 0."""
-    return np.pad(blocks, (0, -len(blocks) % BLOCKS)).reshape(-1, BLOCKS)
+    return np.pad(blocks, (0, -len(blocks) % PIECE_BLOCKS)).reshape(-1, PIECE_BLOCKS)
 
 
 def of_whole(d: StageDiagnosis, sums: Sums, fails: Sequence[Failing]) -> StageDiagnosis:

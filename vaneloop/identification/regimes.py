@@ -14,18 +14,13 @@ import scipy
 
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
 from vaneloop.identification.results import rms_per_output
-from vaneloop.identification.subsystem import KNOWN_TO, Array, without_jumps
+from vaneloop.identification.settings import AGREES, CORRELATION, NOISE_KNOWN_TO, REGIME_BINS, REGIME_LEVEL
+from vaneloop.identification.subsystem import Array, without_jumps
 
 __all__ = [
-    "AGREES", "Located", "Regime", "Shape", "StageFigures", "agrees", "locate", "onset", "regimes", "shape",
+    "Located", "Regime", "Shape", "StageFigures", "agrees", "locate", "onset", "regimes", "shape",
     "stands_out",
 ]  # fmt: skip
-
-# noise floors up to which an error counts as noise: floors are known to some per cent; hil.figures has the same number
-AGREES = 1.1
-CORRELATION = 2.0  # samples that count as one where errors are looked at bin by bin: what clean logs show at most
-BINS = 8
-LEVEL = 0.01  # chance that any bin of any regime is called significant when nothing is missing
 
 
 def agrees(error: float, floor: float) -> bool:
@@ -194,12 +189,12 @@ def locate(judge: LeastSquaresProblem, fit: Fit | None = None) -> Located:
 
 def _edges(values: Array) -> Array:
     """Edges of bins of equal population; a categorical condition gets a bin per value."""
-    some = np.unique(values[: 8 * BINS])  # where these are many, nobody needs to sort all
-    distinct = np.unique(values) if len(some) <= BINS else some
-    if len(distinct) <= BINS:
+    some = np.unique(values[: 8 * REGIME_BINS])  # where these are many, nobody needs to sort all
+    distinct = np.unique(values) if len(some) <= REGIME_BINS else some
+    if len(distinct) <= REGIME_BINS:
         middle = 0.5 * (distinct[1:] + distinct[:-1])
         return np.concatenate([[distinct[0] - 0.5], middle, [distinct[-1] + 0.5]])
-    edges = np.unique(np.quantile(values, np.linspace(0, 1, BINS + 1)))
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, REGIME_BINS + 1)))
     edges[-1] += 1e-9 * max(1.0, abs(edges[-1]))
     return edges
 
@@ -212,7 +207,9 @@ def regimes(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> list[Re
     """
     e, lost = judge.errors(fit.theta[None])[0], judge.lost()
     stage = judge.stage
-    known = (1.0 + KNOWN_TO) ** 2 if stage.lost is not None else 1.0  # drawn floors are as uneven as that is known
+    known = (
+        (1.0 + NOISE_KNOWN_TO) ** 2 if stage.lost is not None else 1.0
+    )  # drawn floors are as uneven as that is known
     raw = []
     looks, blocks = 0, len(judge.block_start)
     block_of = np.repeat(np.arange(blocks), np.diff(judge.block_start, append=e.shape[1]))
@@ -263,9 +260,9 @@ def stands_out(
     whole = _mean(*(x.sum(axis=1) for x in (n, square, floor)))
     rest = _mean(*(x.sum(axis=1) - x[worst] for x in (n, square, floor)))
     z, confirmed = ((ms / known - 1.0) * np.sqrt(np.maximum(m, 1) / (2.0 * correlation)) for m, ms in (whole, rest))
-    return (z > -scipy.special.ndtri(LEVEL / max(looks, 1))) & (confirmed > -scipy.special.ndtri(LEVEL)) & (
-        whole[0] > 20
-    ), *whole
+    return (z > -scipy.special.ndtri(REGIME_LEVEL / max(looks, 1))) & (
+        confirmed > -scipy.special.ndtri(REGIME_LEVEL)
+    ) & (whole[0] > 20), *whole
 
 
 def _mean(n: Array, squares: Array, floor: Array) -> tuple[Array, Array]:

@@ -15,15 +15,15 @@ from typing import Any, Protocol
 import numpy as np
 
 from vaneloop.base.errors import InputError
+from vaneloop.identification.settings import FLOOR_KNOWN, NOISE_KNOWN_TO
 
 __all__ = [
-    "KNOWN_TO", "Bound", "Effect", "Model", "Named", "Parameter", "Stage", "StageError", "noise_of", "reach_of",
+    "Bound", "Effect", "Model", "Named", "Parameter", "Stage", "StageError", "noise_of", "reach_of",
     "size_of", "without_jumps",
 ]  # fmt: skip
 
 Array = np.ndarray
 Named = Mapping[str, Mapping[str, Mapping[str, Any]]]  # effect -> parameter -> value, low, high, unit
-FLOOR_KNOWN = 0.01  # relative error of a noise floor that was estimated from the log
 
 
 class StageError(InputError):
@@ -234,9 +234,6 @@ class Model(Protocol):
         """Hold it against logs. Raises StageError or InputError, in one line, for logs that it cannot be held to."""
 
 
-KNOWN_TO = 0.05  # share by which two estimates of one noise differ on clean logs of some 100 s
-
-
 def reach_of(stage: Stage, floor: Array, theta: Array) -> Array:
     """How close a model can come to each output: ``floor``, and what the effects in ``theta`` make of what happens
     between two rows.
@@ -283,5 +280,5 @@ def noise_of(stage: Stage, theta: Array) -> Array:
         out.append(stage.noise(stage.t, error))
     noise = np.array(out)
     if stage.quiet is not None:
-        noise = np.where(stage.quiet < (1.0 - KNOWN_TO) * noise, stage.quiet, noise)
+        noise = np.where(stage.quiet < (1.0 - NOISE_KNOWN_TO) * noise, stage.quiet, noise)
     return noise if stage.raster_error is None else np.hypot(noise, stage.raster_error)

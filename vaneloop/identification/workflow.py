@@ -17,12 +17,12 @@ from vaneloop.identification.regimes import Located, Shape, StageFigures, agrees
 from vaneloop.identification.results import StageDiagnosis, parameters_of, recalibrated, rms_per_output, weigh
 from vaneloop.identification.selection.diagnosis import Judged, diagnose_stage, extend_stage, floor_of
 from vaneloop.identification.selection.likelihood_acceptance import (
-    NATS,
     LikelihoodAcceptance,
     as_close,
     correlation_of,
     significant,
 )
+from vaneloop.identification.settings import LOOK_EVERY, NATS, SHORT_SEARCH, SIZES_AGREE, USUAL_FITS
 from vaneloop.identification.subsystem import Stage, StageError
 
 __all__ = [
@@ -72,11 +72,6 @@ class News:
     fraction: float
     text: str
     found: StageDiagnosis | None = None
-
-
-OFTEN = 0.1  # s between two looks at searches in other processes
-SHORT = 10  # times smaller than the longest search: takes next to nothing
-USUAL = 60.0  # fits after which half of a stage's search is usually done
 
 
 class _Work:
@@ -164,7 +159,7 @@ def diagnose(
         with in_processes(_one, work, workers) as submit:
             open_jobs = {submit(i): i for i in order}
             while open_jobs:
-                ended, _ = wait(open_jobs, OFTEN if news or progress else None, FIRST_COMPLETED)
+                ended, _ = wait(open_jobs, LOOK_EVERY if news or progress else None, FIRST_COMPLETED)
                 for job in ended:
                     i = open_jobs.pop(job)
                     done[i] = job.result()
@@ -195,7 +190,7 @@ def _order(stages: Sequence[Stage], side_by_side: bool) -> list[int]:
     """
     size = [len(s.effects) * len(s.outputs) for s in stages]
     by_size = sorted(range(len(stages)), key=lambda i: size[i])
-    short = [i for i in by_size if SHORT * size[i] < size[by_size[-1]]]
+    short = [i for i in by_size if SHORT_SEARCH * size[i] < size[by_size[-1]]]
     out = [*short, *(i for i in reversed(by_size) if i not in short)]
     return sorted(out, key=lambda i: i != by_size[-1]) if side_by_side else out
 
@@ -204,7 +199,7 @@ def _how_far(work: _Work, done: set[int]) -> tuple[float, str]:
     """Fraction of the search that is done, and what is being tried: nobody knows how many fits there will be."""
     size = [max(1, len(s.effects)) * len(s.outputs) for s in work.stages]
     fits = [n.value for n in work.fits]
-    share = [1.0 if i in done else fits[i] / (fits[i] + USUAL) for i in range(len(work.stages))]
+    share = [1.0 if i in done else fits[i] / (fits[i] + USUAL_FITS) for i in range(len(work.stages))]
     at_work = [
         f"{stage.name} ({len(stage.effects)} effects, {fits[i]} fits)"
         for i, stage in enumerate(work.stages)
@@ -234,7 +229,7 @@ def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
             options = [f.effect, *f.rivals]
             left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m, _doubt(o, m)) for o in elsewhere[m])]
             if not left:
-                left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m, NEAR) for o in elsewhere[m])]
+                left = [m for m in options if all(_fits(stages, d, f.fits[m], o, m, SIZES_AGREE) for o in elsewhere[m])]
             beside = {
                 g.effect: d.final for g in d.effects if g is not f
             }  # they may have changed since the rivals were fitted
@@ -273,10 +268,7 @@ def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
 
 def _doubt(other: StageDiagnosis, effect: str) -> float:
     """By what share of its size a stage that names an effect too may be wrong about it: errors of form are its own."""
-    return NEAR if any(effect in (g.effect, *g.rivals) for g in other.effects) else 0.0
-
-
-NEAR = 0.5  # share of its size by which a stage may be wrong about an effect that another stage sees too
+    return SIZES_AGREE if any(effect in (g.effect, *g.rivals) for g in other.effects) else 0.0
 
 
 def _with(judge: LeastSquaresProblem, sources: dict[str, Fit]) -> Fit:

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from hil.logs.formats import suffixes
-from vaneloop.identification.user_models.by_log import NO_HELP, ByLog
+from vaneloop.identification.settings import NO_HELP
+from vaneloop.identification.user_models.by_log import ByLog
 from vaneloop.pages.figures import UNDER, Line, Panel, bars, loop, overlay
 from vaneloop.pages.page import Page
 

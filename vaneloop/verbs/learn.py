@@ -16,7 +16,7 @@ from vaneloop.base.files import write
 from vaneloop.identification import StageError, System
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import answer_of, found_of, recalibrated, rms_of
-from vaneloop.identification.selection.relative_error_acceptance import HARM, LEAST_FALL, UNKNOWN
+from vaneloop.identification.settings import HARM, LEAST_FALL, UNKNOWN
 from vaneloop.identification.unmodelled.curve_candidates import SHAPES, UserModelCandidates, on_logs
 from vaneloop.identification.unmodelled.fitted_candidate import Outcome
 from vaneloop.identification.unmodelled.learned_law import law_of

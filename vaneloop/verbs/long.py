@@ -15,11 +15,12 @@ import numpy as np
 
 from hil.logs import LogError
 from vaneloop.base.side_by_side import forks, in_processes
-from vaneloop.identification.chunked_residuals import BLOCKS, Failing, Sums, failing, joined, of_whole, sums_of
+from vaneloop.identification.chunked_residuals import Failing, Sums, failing, joined, of_whole, sums_of
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.regimes import Located
 from vaneloop.identification.results import StageDiagnosis, rms_of, weigh
 from vaneloop.identification.selection.subsampled_search import spread
+from vaneloop.identification.settings import PIECE_BLOCKS
 from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.workflow import Diagnosis, News, locate_stages, verdict_of
 from vaneloop.identification.workflow import diagnose as search
@@ -45,7 +46,7 @@ __all__ = [
 LONG = 360_000  # rows, an hour at 100 Hz; a log with more is fitted on an excerpt
 FITTED = 120_000  # rows of an excerpt, half of them evenly spaced: three times what a stage is searched on
 BLOCK = 10.0  # s, the memory of the stages
-PIECE = BLOCKS * BLOCK  # s: an excerpt is made of such pieces, of which the first 3 s are forgotten
+PIECE = PIECE_BLOCKS * BLOCK  # s: an excerpt is made of such pieces, of which the first 3 s are forgotten
 STRETCH = 16  # pieces that are held against the model at one time; bounds what is in memory
 LEAD = 30.0  # s before a stretch that are simulated with it: play and lags then know where they are
 FAST = 0.1  # s between two looks at what the log visits
@@ -244,7 +245,7 @@ def held_against(
     for name, _, _, level in fits:
         if name in sums:
             hot, ratio = failing(sums[name], level, looks)
-            at = np.arange(hot.shape[1]) + sums[name].first // BLOCKS
+            at = np.arange(hot.shape[1]) + sums[name].first // PIECE_BLOCKS
             worst[at] = np.maximum(worst[at], np.where(hot, ratio, 0.0).max(axis=0))
             out += _times(whole, sums[name], hot, ratio)
     fail = [int(k) for k in np.argsort(-worst, kind="stable") if worst[k] > 0.0]
@@ -259,7 +260,7 @@ def _times(whole: Whole, sums: Sums, hot: Array, ratio: Array) -> list[Failing]:
     for run in np.split(at, np.flatnonzero(np.diff(at) > 1) + 1) if at.size else []:
         mean = np.sqrt(np.mean(np.where(hot[:, run], ratio[:, run], 0.0) ** 2, axis=1))
         k = int(np.argmax(mean))
-        first = sums.first // BLOCKS
+        first = sums.first // PIECE_BLOCKS
         low, high = whole.time(first + int(run[0])), whole.time(first + int(run[-1]) + 1)
         unit, error = sums.units[k], float(mean[k] * sums.floor[k])
         out.append(Failing(sums.stage, sums.outputs[k], unit, low, high, error, float(mean[k])))
@@ -269,7 +270,7 @@ def _times(whole: Whole, sums: Sums, hot: Array, ratio: Array) -> list[Failing]:
 def _stretch(work: Work, k: int) -> list[Sums]:
     """Sums of one stretch of the log at work."""
     whole, chain, fits = work
-    rows, block = whole.rows, whole.rows // BLOCKS
+    rows, block = whole.rows, whole.rows // PIECE_BLOCKS
     first, behind = k * STRETCH * rows, min((k + 1) * STRETCH * rows, whole.grid.rows)
     lead = whole.grid.window * round(LEAD)
     try:

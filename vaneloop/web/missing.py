@@ -9,7 +9,8 @@ from nicegui import events, ui
 
 from plant.effects import EFFECTS
 from vaneloop.base.signals import heading
-from vaneloop.identification.regimes import AGREES, Located
+from vaneloop.identification.regimes import Located
+from vaneloop.identification.settings import AGREES
 from vaneloop.pages.failures import failure_map, worst_cell
 from vaneloop.pages.figures import Line as PageLine
 from vaneloop.pages.figures import Panel as PagePanel

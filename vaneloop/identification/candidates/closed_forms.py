@@ -12,12 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from vaneloop.base.forms import FORMS, Form
+from vaneloop.identification.settings import FORM_DAMPING, FORM_DIFFERENCE, FORM_ENOUGH, FORM_STEPS
 from vaneloop.identification.subsystem import Array
 
 __all__ = ["Formula", "begin", "text_of", "values_of"]
-
-MOST_STEPS = 30  # of least squares from one begin
-DAMPED, DIFFERENCE, ENOUGH = 1.0, 1e-7, 1e-8  # first damping; step of slopes; share of the error that is none
 
 
 @dataclass(frozen=True)
@@ -100,12 +98,12 @@ def _refined(left: Callable[[Array, Array], Array], begins: Array) -> Array:
     rows = np.arange(len(z))
     rest = left(z, rows)
     cost = np.sum(rest * rest, axis=1)
-    damping = np.full(len(z), DAMPED)
-    for _ in range(MOST_STEPS):
+    damping = np.full(len(z), FORM_DAMPING)
+    for _ in range(FORM_STEPS):
         if not len(rows):
             break
         moved = np.repeat(z[rows], k, axis=0)
-        h = DIFFERENCE * np.maximum(np.abs(z[rows]), 1.0)
+        h = FORM_DIFFERENCE * np.maximum(np.abs(z[rows]), 1.0)
         moved[np.arange(len(moved)), np.tile(np.arange(k), len(rows))] += h.ravel()
         slopes = (left(moved, np.repeat(rows, k)).reshape(len(rows), k, -1) - rest[rows][:, None]) / h[:, :, None]
         normal = slopes @ slopes.transpose(0, 2, 1)
@@ -119,7 +117,7 @@ def _refined(left: Callable[[Array, Array], Array], begins: Array) -> Array:
         costs = np.sum(now * now, axis=1)
         better = costs < cost[rows]
         gained = np.where(better, cost[rows] - costs, 0.0)
-        little = better & (gained <= ENOUGH * cost[rows]) | (np.abs(step).max(axis=1) <= ENOUGH)
+        little = better & (gained <= FORM_ENOUGH * cost[rows]) | (np.abs(step).max(axis=1) <= FORM_ENOUGH)
         won = rows[better]
         z[won] += step[better]
         rest[won], cost[won] = now[better], costs[better]

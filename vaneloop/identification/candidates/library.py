@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vaneloop.identification.candidates import laws
+from vaneloop.identification.settings import TRIED_SIZES
 from vaneloop.identification.subsystem import Parameter
 
 __all__ = ["FORCE_LAWS", "LAWS", "SIGNAL_LAWS", "STATE_LAWS", "Law", "Size"]
@@ -87,14 +88,13 @@ class Law:
 # ---- parameters from the size of the data ----------------------------------------------------------------------------
 
 _Made = tuple[tuple[Parameter, ...], tuple[tuple[float, ...], ...]]
-_TINY = (0.01, 0.05, 0.2, 0.6)  # of a place's size: from hardly seen to gross
 
 
 def _one(name: str, unit: str, neutral: float, low: float, high: float, starts: list[float]) -> _Made:
     return (Parameter(name, neutral, unit, low, high),), tuple((float(v),) for v in starts)
 
 
-def _both(size: float, parts: tuple[float, ...] = _TINY) -> list[float]:
+def _both(size: float, parts: tuple[float, ...] = TRIED_SIZES) -> list[float]:
     return [sign * part * size for part in parts for sign in (1.0, -1.0)]
 
 

@@ -17,18 +17,19 @@ import numpy as np
 import scipy
 
 from vaneloop.base.curve import DEGREE, splines
+from vaneloop.identification.settings import (
+    CURVE_SPLINES,
+    EDGE_SHARE,
+    HARMONICS,
+    LEAST_KNOT_DISTANCE,
+    LEAST_SPLINES,
+    LEVEL_SPREAD,
+    STRAY_RANGE,
+    WAVE_SPLINES,
+)
 from vaneloop.identification.subsystem import Array, Effect, Parameter
 
-__all__ = ["COUNT", "FINE_HARMONICS", "HARMONICS", "LEVEL", "Basis", "basis_of", "waves_of"]
-
-COUNT = 10  # splines of a curve
-LEAST = 5  # with fewer it could hardly bend
-RESOLVED = 1e-3  # of the range: knots do not stand closer
-LEVEL = 3.0  # standard deviation of a curve's mean and slope, in its usual size
-HARMONICS, FINE_HARMONICS = 3, 10  # waves of a curve that repeats itself; of one that must be finer
-AROUND = 9  # splines that each of its waves is made of
-EDGE = 0.001  # share of the visited values at each end that may lie apart from the others
-STRAY = 0.25  # of the others' range: no further from them are the first and the last knot
+__all__ = ["Basis", "basis_of", "waves_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,7 @@ class Basis:
         jump    whether half the height of a jump is one more amplitude
         """
         # a tolerance is the half-width of a uniform interval: sqrt(3) standard deviations
-        wide = float(np.sqrt(3.0) * LEVEL * size)
+        wide = float(np.sqrt(3.0) * LEVEL_SPREAD * size)
         out = []
         for k in kept:
             step, plain = self.rises and k > 0, k < self.straight
@@ -109,26 +110,26 @@ class Basis:
         return Effect(name, tuple(out), starts)
 
 
-def basis_of(visited: Array, count: int = COUNT) -> Basis | None:
+def basis_of(visited: Array, count: int = CURVE_SPLINES) -> Basis | None:
     """The basis for a quantity that has been at these values; None where there are too few different ones.
 
     Knots stand at their quantiles: a curve is as fine as the log tells.
     """
     x = np.sort(np.asarray(visited, dtype=float)[np.isfinite(visited)])
-    if len(x) < 4 * LEAST:
+    if len(x) < 4 * LEAST_SPLINES:
         return None
     if len(few := np.unique(x)) in (2, 3):
         return _straight(x, float(few[0]), float(few[-1]))
-    low, high = (float(np.quantile(x, q)) for q in (EDGE, 1.0 - EDGE))
+    low, high = (float(np.quantile(x, q)) for q in (EDGE_SHARE, 1.0 - EDGE_SHARE))
     if not high - low > 1e-12 * max(abs(low), abs(high), 1e-300):
         return None
-    apart = STRAY * (high - low)
+    apart = STRAY_RANGE * (high - low)
     low, high = max(low - apart, float(x[0])), min(high + apart, float(x[-1]))
     z = (x[(x >= low) & (x <= high)] - low) / (high - low)
     inner = np.quantile(np.unique(z), np.linspace(0.0, 1.0, count - DEGREE + 1)[1:-1])
-    inner = np.unique(np.round(inner / RESOLVED)) * RESOLVED
-    inner = inner[(inner > RESOLVED) & (inner < 1.0 - RESOLVED)]
-    if len(np.unique(z)) < LEAST or len(inner) + DEGREE + 1 < LEAST:
+    inner = np.unique(np.round(inner / LEAST_KNOT_DISTANCE)) * LEAST_KNOT_DISTANCE
+    inner = inner[(inner > LEAST_KNOT_DISTANCE) & (inner < 1.0 - LEAST_KNOT_DISTANCE)]
+    if len(np.unique(z)) < LEAST_SPLINES or len(inner) + DEGREE + 1 < LEAST_SPLINES:
         return None
     knots = np.concatenate([np.zeros(4), inner, np.ones(4)])
     n = len(knots) - DEGREE - 1
@@ -155,7 +156,7 @@ def waves_of(period: float, harmonics: int = HARMONICS) -> Basis:
     """The basis for a quantity that repeats itself: a constant, a sine and a cosine of its ``period``, and up to
     ``harmonics`` times as fast ones.
     """
-    around = AROUND * harmonics
+    around = WAVE_SPLINES * harmonics
     knots = np.concatenate([np.zeros(DEGREE), np.linspace(0.0, 1.0, around - DEGREE + 1), np.ones(DEGREE)])
     z = np.linspace(0.0, 1.0, 8 * around)
     order = np.arange(1, harmonics + 1)

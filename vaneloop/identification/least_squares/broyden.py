@@ -14,11 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vaneloop.identification.settings import KEPT_SLOPES
 from vaneloop.identification.subsystem import Array
 
 __all__ = ["NOT_KNOWN", "BroydenJacobian", "Known", "LatestSlopes", "bounded_step"]
-
-VALUES = 2_000_000  # of slopes that are kept, 16 MB
 
 
 class Known(NamedTuple):
@@ -75,7 +74,7 @@ class LatestSlopes:
     def put(self, theta: Array, free: Array, error: Array, slopes: Array) -> None:
         """Keep these; the oldest go."""
         self._kept[theta.tobytes(), free.tobytes()] = error, slopes
-        while sum(rows.size for _, rows in self._kept.values()) > VALUES:
+        while sum(rows.size for _, rows in self._kept.values()) > KEPT_SLOPES:
             del self._kept[next(iter(self._kept))]
 
     def get(self, theta: Array, free: Array) -> tuple[Array, Array] | None:

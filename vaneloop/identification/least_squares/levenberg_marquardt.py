@@ -14,20 +14,19 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from vaneloop.identification.least_squares.broyden import NOT_KNOWN, BroydenJacobian, Known, bounded_step
+from vaneloop.identification.settings import (
+    CARRIED_STEP,
+    CARRIED_VALUES,
+    DAMPING_TIMES,
+    EVIDENCE,
+    LEAST_STEP_FALL,
+    MOST_DAMPED,
+    PROMISE_KEPT,
+)
 from vaneloop.identification.subsystem import Array, Stage
 
-__all__ = ["EVIDENCE", "STILL", "Begin", "End", "carries", "levenberg_marquardt"]
+__all__ = ["Begin", "End", "carries", "levenberg_marquardt"]
 
-# Independent observations of an output that a log is worth at most: the model's equations are not nature's, and an
-# error of form does not average out however long the log. Set on logs of the rig, so that intervals cover the truth as
-# often as they say (docs/diagnosis.md).
-EVIDENCE = 200.0
-STILL = 1e-3  # share by which a fit that goes on must fall, of a model whose own parameters are known roughly
-DAMPED = (0.01, 1.0, 300.0)  # times the damping so far, tried at one time
-MOST_DAMPED = 4  # tries at ever shorter steps, down to some 1e-15 of a full one
-KEPT = 0.5  # share of what slopes promised that a step must bring for them to be carried on
-STEP = 0.34  # of an iteration that a step by carried slopes counts at least
-CARRIED = 400_000  # values of slopes that are carried along by one fit, 3 MB
 
 Linear = tuple[Array, Array, Array]  # costs, gradients and normals of the blocks
 
@@ -110,7 +109,7 @@ class Problem(Protocol):
 
 def carries(problem: Problem, free: Array) -> bool:
     """Whether slopes by these columns are carried along: a stage may not want that, and they may be too many."""
-    return problem.stage.carries and len(free) * problem.measured.size <= CARRIED
+    return problem.stage.carries and len(free) * problem.measured.size <= CARRIED_VALUES
 
 
 def levenberg_marquardt(problem: Problem, free: Array, begin: Begin, iterations: int) -> Generator[Array, Array, End]:
@@ -133,7 +132,10 @@ def levenberg_marquardt(problem: Problem, free: Array, begin: Begin, iterations:
         known, slopes = all_slopes((yield asked))
         carried, fresh = BroydenJacobian(known, slopes), False
         here = float(total(problem.block_costs(known[None]), theta[None])[0])
-    left, carried_step = float(iterations), max(STEP, len(DAMPED) / (len(DAMPED) + max(len(free), 1)))
+    left, carried_step = (
+        float(iterations),
+        max(CARRIED_STEP, len(DAMPING_TIMES) / (len(DAMPING_TIMES) + max(len(free), 1))),
+    )
     first = ahead = True  # whether no step was made; whether the last was made by simulated slopes
     while left > 1e-9:
         left -= 1.0 if fresh else carried_step
@@ -153,7 +155,7 @@ def levenberg_marquardt(problem: Problem, free: Array, begin: Begin, iterations:
         little = 0.2 * len(free)
         if problem.roughly:
             little *= 1.0 + max(here - problem.n, 0.0) / EVIDENCE
-        least = max(little, STILL * (here - problem.n)) if problem.sparing else little
+        least = max(little, LEAST_STEP_FALL * (here - problem.n)) if problem.sparing else little
         a, g = a + np.diag(prior * scale**2), g - prior * scale * (theta[free] - expected[free])
         limits = [(b[free] - theta[free]) / scale for b in (low, high)]
         if (problem.roughly and not first) or (fresh and not ahead):
@@ -166,7 +168,7 @@ def levenberg_marquardt(problem: Problem, free: Array, begin: Begin, iterations:
         first, ahead = False, fresh
         for _ in range(MOST_DAMPED if fresh else 1):
             trials, steps = [], []
-            for factor in DAMPED:
+            for factor in DAMPING_TIMES:
                 damped = a + damping * factor * np.diag(np.maximum(np.diag(a), 1e-9))
                 step = bounded_step(damped, g, *limits)
                 trial = theta.copy()
@@ -185,7 +187,7 @@ def levenberg_marquardt(problem: Problem, free: Array, begin: Begin, iterations:
             damping *= 1e5
         gained = here - float(costs[k])
         if gained > 0.0:
-            damping, theta, known, linear = max(damping * DAMPED[k], 1e-9), thetas[k], errors[k].copy(), None
+            damping, theta, known, linear = max(damping * DAMPING_TIMES[k], 1e-9), thetas[k], errors[k].copy(), None
             here = float(costs[k])
         if not gained > 0.0 or gained < least:
             if fresh:
@@ -193,8 +195,8 @@ def levenberg_marquardt(problem: Problem, free: Array, begin: Begin, iterations:
             fresh = True  # the slopes that were carried here may be wrong
             continue
         if fresh:
-            lately = gained * len(DAMPED) / (len(DAMPED) + len(free))
-        keep = carried is not None and gained > max(KEPT * _promised(steps[k], a, g), lately)
+            lately = gained * len(DAMPING_TIMES) / (len(DAMPING_TIMES) + len(free))
+        keep = carried is not None and gained > max(PROMISE_KEPT * _promised(steps[k], a, g), lately)
         if keep and carried is not None and known is not None:
             carried.moved(steps[k], known)
         fresh = not keep

@@ -19,15 +19,18 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known, LatestSlopes
-from vaneloop.identification.least_squares.levenberg_marquardt import (
-    EVIDENCE,
-    STILL,
-    Begin,
-    End,
-    carries,
-    levenberg_marquardt,
-)
+from vaneloop.identification.least_squares.levenberg_marquardt import Begin, End, carries, levenberg_marquardt
 from vaneloop.identification.least_squares.residuals import ResidualCache, normalise_residuals
+from vaneloop.identification.settings import (
+    DIFFERENCE,
+    EVIDENCE,
+    LEAST_STEP_FALL,
+    MAX_SETS,
+    MAX_VALUES,
+    MIN_BLOCKS,
+    MOST_BLOCKS,
+    USUAL_BLOCKS,
+)
 from vaneloop.identification.subsystem import Array, Stage, StageError
 
 __all__ = ["Fit", "LeastSquaresProblem", "Task", "covariance", "finished", "recalibrate"]
@@ -38,12 +41,6 @@ Task = Generator[
 ]  # yields parameter sets [sets, parameters], gets whitened errors [sets, outputs, samples]
 
 Moves = tuple[int | None, int | None]  # the only output and the only log that a parameter moves; None: all
-
-MIN_BLOCKS = 12  # enough to tell a gain that is everywhere from one lucky stretch
-BLOCKS, MOST_BLOCKS = 24, 60  # blocks of a stage of unknown memory; at most
-MAX_SETS = 64  # parameter sets in one call of run
-MAX_VALUES = 8_000_000  # errors of several tasks held at one time
-DIFFERENCE = 1e-3  # of a parameter's scale: quantised outputs need steps this large
 
 
 @dataclass(eq=False)
@@ -94,7 +91,9 @@ class LeastSquaresProblem:
         self._near = LatestSlopes()
         self.spared: set[int] = set()  # columns of nominal parameters that stay where they are
         self.roughly = False  # a fit that leaves more than noise ends when it gains less than `EVIDENCE` can tell
-        self.sparing = False  # one ends when a step takes off less than `STILL` of what it leaves beyond noise
+        self.sparing = (
+            False  # one ends when a step takes off less than `LEAST_STEP_FALL` of what it leaves beyond noise
+        )
         self.valid = np.isfinite(stage.measured)
         if keep is not None:
             self.valid &= keep
@@ -105,7 +104,7 @@ class LeastSquaresProblem:
             w = np.minimum(((t - t[0]) / stage.window + 1e-9).astype(int), max(int(span / stage.window + 1e-9) - 1, 0))
         else:
             w = None
-        self.memory = stage.memory or span / BLOCKS  # s, the stage's own time scale
+        self.memory = stage.memory or span / USUAL_BLOCKS  # s, the stage's own time scale
         blocks = int(np.clip(span / self.memory, MIN_BLOCKS, MOST_BLOCKS))
         if w is not None:
             per = max(1, round((w[-1] + 1) / blocks))
@@ -486,7 +485,7 @@ def finished(judge: LeastSquaresProblem, task: Task[Fit], go_on: bool = True) ->
         gained = judge.total_of(fit) - judge.total_of(more)
         if gained > 0.0:
             fit = more
-        if gained < STILL * fit.cost.sum():
+        if gained < LEAST_STEP_FALL * fit.cost.sum():
             break
     return fit
 

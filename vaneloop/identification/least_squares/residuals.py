@@ -10,11 +10,10 @@ from collections.abc import Callable
 import numpy as np
 
 from vaneloop.base.compiled import compiled_free
+from vaneloop.identification.settings import KEPT_ERRORS, NO_ANSWER_ERROR
 from vaneloop.identification.subsystem import Array
 
-__all__ = ["FAR", "ResidualCache", "normalise_residuals"]
-
-FAR = 1e6  # noise floors: the error of a sample of which the model says nothing; no fit ends there
+__all__ = ["ResidualCache", "normalise_residuals"]
 
 
 @compiled_free
@@ -23,7 +22,7 @@ def normalise_residuals(
 ) -> None:
     """Fill out[set, output, sample] with (measured - model) / floor, less its mean over each window.
 
-    model     [sets, outputs, samples]; a value that is not finite is off by `FAR`
+    model     [sets, outputs, samples]; a value that is not finite is off by `NO_ANSWER_ERROR`
     measured  [outputs, samples], finite
     counted   1.0 where a sample counts, else 0.0: [outputs, samples]
     floor     of each output
@@ -35,7 +34,7 @@ def normalise_residuals(
             e, to_floor = out[k, o], 1.0 / floor[o]
             for i in range(n):
                 error = measured[o, i] - model[k, o, i]
-                e[i] = counted[o, i] * (error * to_floor if math.isfinite(error) else FAR)
+                e[i] = counted[o, i] * (error * to_floor if math.isfinite(error) else NO_ANSWER_ERROR)
             for w in range(len(starts)):
                 end = starts[w + 1] if w + 1 < len(starts) else n
                 total = many = 0.0
@@ -48,8 +47,6 @@ def normalise_residuals(
 
 
 # ---- Errors of the parameter sets that were simulated last: one set in ten is asked for again soon
-
-VALUES = 4_000_000  # that are kept, 32 MB
 
 
 class ResidualCache:
@@ -73,7 +70,7 @@ class ResidualCache:
             made = simulate(thetas[list(new.values())]) if new else thetas
             of = {**self._kept, **dict(zip(new, made, strict=False))}
             out = np.array([of[key] for key in keys])
-        most = VALUES // max(out[0].size, 1)
+        most = KEPT_ERRORS // max(out[0].size, 1)
         first = max(len(new) - most, 0)
         for key, errors in list(zip(new, made, strict=False))[first:]:
             self._kept[key] = errors.copy()

@@ -16,17 +16,14 @@ import numpy as np
 
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
 from vaneloop.identification.results import Candidate, StageDiagnosis, answer_of, found_of, parameters_of, rms_of
-from vaneloop.identification.selection.likelihood_acceptance import TOLERATED, LikelihoodAcceptance
+from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
 from vaneloop.identification.selection.search import Criterion, Search
 from vaneloop.identification.selection.subsampled_search import excerpt_of, searched
+from vaneloop.identification.settings import EXCERPT_PIECE, EXCERPT_SAMPLES, LONG_SAMPLES, PAIR_LEADERS, TOLERATED
 from vaneloop.identification.subsystem import Array, Stage, StageError, noise_of, reach_of
 
 __all__ = ["Judged", "diagnose_stage", "extend_stage", "floor_of"]
 
-LONG = 60_000  # samples; a stage with more is searched on an excerpt
-SEARCHED = 40_000  # samples of an excerpt, about
-PIECE = 4_000  # samples in a row: longer than the memory of any stage here
-WAYS = 2  # leading effects from which else pairs are tried, where those found leave more than noise
 
 Judged = Callable[[LeastSquaresProblem], Criterion]  # makes the criterion of a stage
 Said = tuple[Search, Fit, list[Candidate], list[tuple[str, float]]]
@@ -57,15 +54,15 @@ def diagnose_stage(
     What is found there is fitted to the whole log and has to earn its place again; where the whole log shows more, a
     second excerpt is taken from what is left.
     """
-    if stage.excerpt is None or len(stage.t) < LONG:
+    if stage.excerpt is None or len(stage.t) < LONG_SAMPLES:
         return _unless_coarse(stage, _to_the_floor(stage, floor, keep, tick, judged))
     judge = LeastSquaresProblem(stage, floor, keep)
-    at = excerpt_of(judge, None, PIECE, SEARCHED)
+    at = excerpt_of(judge, None, EXCERPT_PIECE, EXCERPT_SAMPLES)
     even = LeastSquaresProblem(stage.excerpt(at), floor, None if keep is None else keep[..., at])
     base = judge.fit((), recalibrate(even).theta)  # from near it, where few steps are left
     left = base
     for _ in range(2):
-        at = excerpt_of(judge, left, PIECE, SEARCHED)
+        at = excerpt_of(judge, left, EXCERPT_PIECE, EXCERPT_SAMPLES)
         part = stage.excerpt(at)
         said = _to_the_floor(part, floor, None if keep is None else keep[..., at], tick, judged)
         found = _confirm(stage, keep, floor, base, said, judged)
@@ -251,7 +248,7 @@ def _on_another_way(search: Search, current: Fit, singles: dict[str, Fit]) -> Fi
     others = [m for m in others if m not in (*current.effects, *criterion.left_out)]
     others.sort(key=lambda m: criterion.order(singles[m]))
     names = [e.name for e in search.stage.effects if e.name not in criterion.left_out]
-    pairs = [f for o in others[:WAYS] for f in search.best_of([(o, m) for m in names if m != o])[:1]]
+    pairs = [f for o in others[:PAIR_LEADERS] for f in search.best_of([(o, m) for m in names if m != o])[:1]]
     pairs = [f for f in pairs if set(f.effects) != set(current.effects) and criterion.earns(current, f)]
     return min(pairs, key=criterion.order, default=None)
 

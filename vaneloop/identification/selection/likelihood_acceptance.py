@@ -30,32 +30,29 @@ from vaneloop.identification.results import (
     rms_of,
     rms_per_output,
 )
-from vaneloop.identification.subsystem import FLOOR_KNOWN
+from vaneloop.identification.settings import (
+    BLOCK_SPREADS,
+    CREDIBLE,
+    EXPLAINED,
+    FLOOR_KNOWN,
+    LEAST_SHARE,
+    LEFT_FLOORS,
+    NATS,
+    RIVAL_NATS,
+    RIVAL_SHARE,
+    RIVAL_SPREADS,
+    SPREADS,
+    TOLERATED,
+)
 
 if TYPE_CHECKING:
     from vaneloop.identification.selection.search import Search
 
 __all__ = [
-    "EXPLAINED", "NATS", "RIVAL_SPREADS", "LikelihoodAcceptance", "as_close", "correlation_of", "gain",
+    "LikelihoodAcceptance", "as_close", "correlation_of", "gain",
     "leaves_too_much", "significant", "with_rivals",
 ]  # fmt: skip
 
-NATS = 12.0  # gain that the best of a library of useless effects reaches in fewer than 1 of 100 clean logs, with margin
-SPREADS = 3.0  # the definition of detectable
-BLOCK_SPREADS = 8.0  # for an effect that shows in few blocks only
-RIVAL_NATS = 3.0  # odds of 20 to 1, by which one of two effects that both earn their place beats the other
-# and the fall of the error: more than an effect that is not there gains by the errors of form of a clean log
-RIVAL_SPREADS = 0.3
-CREDIBLE = 0.9  # an effect and its rivals have at least this probability together
-RIVAL_SHARE = 0.25  # and share of what it leaves above the floor itself: the library's equations are not nature's
-TOLERATED = 1.05  # error over noise floor at which nothing is missing any more
-# Share of the excess over the floor that a further effect must explain (less is one effect patching another's
-# equation), and that a model of the right kind may leave (its equation is not nature's): what is left then would not
-# have earned a further effect either.
-LEAST_SHARE = 0.15
-EXPLAINED = 0.5  # share of the excess over the floor that all effects named in a stage must explain together
-# noise floors that a model with one effect may leave, whatever share of the excess it explains; two effects: 2
-LEFT_FLOORS = 3.0
 BOUND = "fits only at the end of its physical range"
 
 

@@ -29,27 +29,29 @@ import numpy as np
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.regimes import agrees
 from vaneloop.identification.results import Candidate, Found, StageDiagnosis, answer_of, at_bound, parameters_of, rms_of
+from vaneloop.identification.settings import (
+    AGREE,
+    BETTER,
+    FLAT,
+    FORM,
+    HARM,
+    LEAST_FALL,
+    LEAST_HELP,
+    LEAST_OF_NOISE,
+    LEAST_USE,
+    MOST_LEFT,
+    PER_PARAMETER,
+    RIVAL,
+    STRUCTURE,
+    UNKNOWN,
+)
 from vaneloop.identification.subsystem import Array
 
 if TYPE_CHECKING:
     from vaneloop.identification.selection.search import Search
 
-__all__ = ["LEAST_FALL", "RelativeErrorAcceptance", "structure", "worth"]
+__all__ = ["RelativeErrorAcceptance", "structure", "worth"]
 
-LEAST_FALL = 0.20  # share of the held-out sum of squares beyond noise that an effect must explain
-LEAST_OF_NOISE = 0.10  # and share of the noise (5 % of its RMS)
-FORM = 0.02  # of the error that laws are to explain: no equation of friction or flow is known better
-LEAST_HELP = 0.75  # share of the change over the blocks that is improvement
-AGREE = 0.05  # fall of a block's log mean square that counts as agreement
-FLAT = 0.1  # of the whole log's error: a block with less is as good as perfect
-PER_PARAMETER = 0.01  # log error that a parameter costs when sets are compared
-RIVAL = 0.05  # log error within which two effects do equally well
-BETTER = 0.02  # log error by which one must be better to be exchanged for another
-HARM = 0.10  # log error by which a test log may get worse
-LEAST_USE = 0.02  # log error by which some log must get better
-UNKNOWN = 1.25  # times the most noise that the samples can hold: what is left is not noise, whatever predicts it
-MOST_LEFT = 0.25  # of the sum of squares beyond noise may be left: what does not even halve the error is not the answer
-STRUCTURE = 0.25  # share of the error left that the logged channels predict, from which it is called unknown physics
 
 Figures = Callable[[Array], Mapping[str, float]]  # parameters -> log -> log of its RMS error
 

@@ -12,13 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.settings import SAME_SIZE, SCREEN_LINE, SCREEN_TOGETHER
 from vaneloop.identification.subsystem import Array, Effect, Stage
 
-__all__ = ["LINE", "Linearisation", "along", "followed", "out_of", "within"]
-
-LINE = (0.02, 5.0)  # times the size tried, within which a better size is looked for
-TOGETHER = 16  # sets whose slopes are simulated at one time
-SAME = (0.8, 1.25)  # times a size that count as that size
+__all__ = ["Linearisation", "along", "followed", "out_of", "within"]
 
 
 class Linearisation:
@@ -80,7 +77,7 @@ class Linearisation:
             own = np.diag([sizes[outputs, s].sum() + 1e-9 for outputs in of])
             a = np.block([[self._normal, both.T], [both, own]])
             g = np.concatenate([pull, [pulls[outputs, s].sum() for outputs in of]])
-            ends = zip(self._room, (0.0, LINE[1]), strict=True)
+            ends = zip(self._room, (0.0, SCREEN_LINE[1]), strict=True)
             low, high = (np.concatenate([room, np.full(len(of), end)]) for room, end in ends)
             step = _best_within(a, g, low, high)
             out.append((here - 2.0 * g @ step + step @ a @ step, step[:k], step[k:]))
@@ -98,7 +95,7 @@ class Linearisation:
         down = -(d @ e0 - followed @ pull0)
         here = float(e0 @ e0 - pull0 @ _solved(self._normal, pull0))
         good = size > 1e-9 * np.maximum(np.sum(d * d, axis=1), 1e-300)
-        share = np.clip(np.where(good, down / np.where(good, size, 1.0), 0.0), *LINE)
+        share = np.clip(np.where(good, down / np.where(good, size, 1.0), 0.0), *SCREEN_LINE)
         return share, here - 2.0 * share * down + share**2 * size
 
 
@@ -147,8 +144,8 @@ def followed(judge: LeastSquaresProblem, thetas: list[Array], free: Array, prior
     """
     scale, high = judge.scale[free], judge.bounds()[1]
     errors, costs = [], []
-    for i in range(0, len(thetas), TOGETHER):
-        batch = [judge.differences(theta, free, scale, high) for theta in thetas[i : i + TOGETHER]]
+    for i in range(0, len(thetas), SCREEN_TOGETHER):
+        batch = [judge.differences(theta, free, scale, high) for theta in thetas[i : i + SCREEN_TOGETHER]]
         all_errors = judge.errors(np.concatenate([asked for asked, _ in batch]))
         at = 0
         for k, (asked, derivative) in enumerate(batch, i):
@@ -200,7 +197,7 @@ def along(effect: Effect, start: Array, share: float, low: Array, high: Array) -
 
     Shapes stay: they say how it acts, not how much.
     """
-    if SAME[0] < share < SAME[1]:
+    if SAME_SIZE[0] < share < SAME_SIZE[1]:
         return None
     sizes = np.array([not p.shape for p in effect.parameters])
     neutral = np.array([p.value for p in effect.parameters])

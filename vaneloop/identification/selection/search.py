@@ -14,15 +14,13 @@ import numpy as np
 from vaneloop.identification.least_squares.broyden import NOT_KNOWN, bounded_step
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, Led, Task, finished, recalibrate
 from vaneloop.identification.selection.screening import Linearisation, along, followed, onward, out_of, within
+from vaneloop.identification.settings import DIRECTIONS, STARTS_TOGETHER
 from vaneloop.identification.subsystem import Array, Effect
 
 if TYPE_CHECKING:
     from vaneloop.identification.results import Candidate, Found, StageDiagnosis
 
 __all__ = ["Criterion", "Search"]
-
-SCREENED = 32  # starts simulated at one time
-DIRECTIONS = 12  # from which a fit of an effect with a direction may start
 
 
 class Criterion(Protocol):
@@ -173,11 +171,11 @@ class Search:
         costs: list[float] = []
         shares: list[float] = []  # these two only of a model that roams
         promised: list[float] = []
-        for i in range(0, len(thetas), SCREENED):
-            part = thetas[i : i + SCREENED]
+        for i in range(0, len(thetas), STARTS_TOGETHER):
+            part = thetas[i : i + STARTS_TOGETHER]
             if self.stage.quick:
                 errors, left = followed(judge, part, self.base.free, self.base.prior)
-                thetas[i : i + SCREENED] = part
+                thetas[i : i + STARTS_TOGETHER] = part
             else:
                 errors = judge.errors(np.array(part))
                 left = slopes.left(errors)

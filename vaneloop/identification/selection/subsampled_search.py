@@ -14,17 +14,23 @@ from functools import cached_property
 import numpy as np
 
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, Task
-from vaneloop.identification.selection.likelihood_acceptance import NATS, LikelihoodAcceptance, rival_nats
-from vaneloop.identification.selection.search import DIRECTIONS, SCREENED, Criterion, Search
+from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, rival_nats
+from vaneloop.identification.selection.search import Criterion, Search
+from vaneloop.identification.settings import (
+    AHEAD_SAMPLES,
+    DIRECTIONS,
+    FITTED_ALONE,
+    FITTED_BESIDE,
+    LEAST_PROMISE,
+    LITTLE_TOLD,
+    NATS,
+    SHORT_PIECE,
+    STARTS_TOGETHER,
+)
 from vaneloop.identification.subsystem import Array, Effect, Stage
 
 __all__ = ["SubsampledSearch", "excerpt_of", "searched", "spread"]
 
-AHEAD = 8_000  # samples of the excerpt, about
-LITTLE = 0.5  # of what counts in the best piece: a piece with less tells little
-PIECE = 500  # samples in a row: many short pieces are more like the log than few long ones
-ALONE, BESIDE = 12, 8  # effects that are fitted alone, and beside others: those that promise most on the whole log
-LEAST = 0.5  # share of what an effect must gain (`NATS`) that it must promise, or it is not fitted
 Promise = tuple[float, Array]  # sum of squares, parameters
 
 
@@ -33,7 +39,7 @@ def searched(
 ) -> Search:
     """The search of a stage: with one ahead, where the stage is long enough."""
     stage = criterion.judge.stage
-    if stage.excerpt is None or len(stage.t) < 2 * AHEAD or not isinstance(criterion, LikelihoodAcceptance):
+    if stage.excerpt is None or len(stage.t) < 2 * AHEAD_SAMPLES or not isinstance(criterion, LikelihoodAcceptance):
         return Search(criterion, tick)
     return SubsampledSearch(criterion, judged, tick)
 
@@ -115,8 +121,8 @@ class SubsampledSearch(Search):
         here = float(np.sum(slopes.error**2))
         out: dict[str, Promise] = {e.name: (here, fit.theta) for e in stage.effects if e.name not in key}
         asked = [(e, np.array(s)) for e in stage.effects if e.name not in key for s in _tried(e)]
-        for i in range(0, len(asked), SCREENED):
-            part = asked[i : i + SCREENED]
+        for i in range(0, len(asked), STARTS_TOGETHER):
+            part = asked[i : i + STARTS_TOGETHER]
             thetas = np.repeat(fit.theta[None], len(part), axis=0)
             for theta, (e, s) in zip(thetas, part, strict=True):
                 theta[index[e.name]] = s
@@ -145,7 +151,7 @@ class SubsampledSearch(Search):
         """The search on the excerpt."""
         judge = self.judge
         assert self.stage.excerpt is not None
-        at = excerpt_of(judge, self.base, PIECE, AHEAD)
+        at = excerpt_of(judge, self.base, SHORT_PIECE, AHEAD_SAMPLES)
         part = LeastSquaresProblem(self.stage.excerpt(at), judge.floor, judge.valid[:, at])
         part.roughly = True
         return _Ahead(self._judged(part), self.tick, self.starts)
@@ -154,7 +160,7 @@ class SubsampledSearch(Search):
         """Fits with one effect each: of those that lead to the whole log, of the others as they stand."""
         base = float(self.base.cost.sum())
         promising = sorted(names, key=lambda n: self.level[n])
-        promising = [n for n in promising if base - self.level[n] > LEAST * 2.0 * NATS][:ALONE]
+        promising = [n for n in promising if base - self.level[n] > LEAST_PROMISE * 2.0 * NATS][:FITTED_ALONE]
         out = dict.fromkeys(names, self.base)
         ahead = self.ahead.best_of([(n,) for n in promising]) if promising else []
         rough = [self._rough(f) for f in ahead]
@@ -166,12 +172,12 @@ class SubsampledSearch(Search):
         """Rank these sets of effects on the excerpt; fit those that lead to the whole log, and return them, best first.
         None is worth it that does no better than one of fewer effects.
         """
-        if len(sets) > BESIDE + 2:
-            sets = sorted(sets, key=lambda s: self._known_promise(s)[0])[:BESIDE]
+        if len(sets) > FITTED_BESIDE + 2:
+            sets = sorted(sets, key=lambda s: self._known_promise(s)[0])[:FITTED_BESIDE]
         new = [s for s in sets if frozenset(s) not in self.fits]
         rough = [self._rough(f) for f in (self.ahead.best_of(new) if new else ())]
         fewer = min(self.judge.total_of(f) for key, f in self.fits.items() if len(key) < len(sets[0]))
-        rough = [f for f in rough if fewer - self.judge.total_of(f) > LEAST * 2.0 * NATS]
+        rough = [f for f in rough if fewer - self.judge.total_of(f) > LEAST_PROMISE * 2.0 * NATS]
         known = [self.fits[k] for k in map(frozenset, sets) if k in self.fits]
         return sorted(self._fitted([*known, *rough], self.criterion.finished), key=self.criterion.order)
 
@@ -308,7 +314,7 @@ def _telling(stage: Stage, length: int, pieces: int, many: int) -> Array:
         return np.arange(pieces)
     rows = np.arange(length)
     counts = np.array([np.count_nonzero(stage.counted(k * length + rows)) for k in range(pieces)])
-    least = min(LITTLE * counts.max(), np.sort(counts)[-min(many, pieces)])
+    least = min(LITTLE_TOLD * counts.max(), np.sort(counts)[-min(many, pieces)])
     return np.flatnonzero(counts >= least)
 
 

@@ -14,7 +14,21 @@ from vaneloop.identification.candidates.closed_forms import Formula, begin, text
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, covariance
 from vaneloop.identification.regimes import agrees
 from vaneloop.identification.results import rms_of
-from vaneloop.identification.selection.relative_error_acceptance import FORM, score
+from vaneloop.identification.selection.relative_error_acceptance import score
+from vaneloop.identification.settings import (
+    FORM,
+    FORM_FAR,
+    FORM_MEAN_VALUES,
+    FORM_NOTHING,
+    FORM_POOR,
+    FORM_SAME,
+    FORM_SHAPED,
+    FORM_STEEPER,
+    FORMS_ALIKE,
+    FORMS_NEAR,
+    FORMS_REFITTED,
+    PER_NUMBER,
+)
 from vaneloop.identification.subsystem import Array, Effect, Parameter
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
 from vaneloop.identification.unmodelled.fitted_candidate import (
@@ -28,19 +42,8 @@ from vaneloop.identification.user_models.terms import runs
 
 __all__ = ["effect_of", "fitted_formulas", "goes_on", "library_name", "likely"]
 
-CLOSE = 1e-4  # share of a curve's variance below which formulas are alike
-REFITTED = 5  # formulas that are fitted in the simulation
-NEAR = 0.05  # share of the error by which a formula may be worse than the best and is still given
-POOR = 1.5  # times the error of the curve itself: a formula that is worse is not the curve
-SHAPED = 0.2  # share of a curve's variance that a formula may leave, to be fitted at all
 STRAIGHT = ("constant", "line", "straight line")
 DEGREES = ("degC", "°C", "C")
-FAR = 100.0  # times the curve's range that a formula's may be
-SAME = 0.02  # share of its spread by which a formula must differ from a simpler one to be given beside it
-MEANT = 2_000  # values of a quantity of which a formula's mean is taken
-NOTHING = 1e-200  # RMS of a formula where the logs have been, below which it says nothing there
-STEEPER = 10.0  # times the steepest slope where the logs have been: beyond, a formula runs away
-PER_NUMBER = 0.005  # log error that a number of a formula costs
 
 
 def _visited(tried: FittedCandidate) -> Array:
@@ -77,12 +80,12 @@ def fitted_formulas(
     at_visited = tried.at(visited, tried.table()[1])
     lent = c.lent | ({0, 1} if loose else set())
     variance, spread = _variance(tried, visited), max(float(np.var(at_visited)), 1e-300)
-    weights = [1.0 / np.sqrt(variance + CLOSE * spread)]
+    weights = [1.0 / np.sqrt(variance + FORMS_ALIKE * spread)]
     if not agrees(rms_of(tried.judge, tried.fit), 1.0):
         weights.append(np.ones(len(visited)))
     ranked = [_nearest(c, visited, at_visited, variance, lent, weight) for weight in weights]
     taken = {form.name: (form, numbers) for turn in zip_longest(*ranked) for form, numbers in filter(None, turn)}
-    shaped = list(taken.values())[:REFITTED]
+    shaped = list(taken.values())[:FORMS_REFITTED]
     fitted = [f for f in side_by_side(lambda s: _in_simulation(ground, tried, *s), shaped, ground.shares) if f]
     grain = tried.judge.stage.grain
     return sorted(fitted, key=lambda f: np.log(f[0].error) / grain + PER_NUMBER * len(f[0].numbers))
@@ -108,31 +111,31 @@ def _nearest(
         # a gain takes a line through 0, and leaves another mean than a line about the middle: only the bends tell
         free = {*lent, 0} if 1 in lent and form.name not in STRAIGHT else lent
         got = begin(form, visited, at_visited, free, weight)
-        if got is not None and np.ptp(form.value(visited, got[0])) > FAR * np.ptp(at_visited):
+        if got is not None and np.ptp(form.value(visited, got[0])) > FORM_FAR * np.ptp(at_visited):
             continue  # nearly a straight line, of which the parameters would have to take all but the bend
-        if got is not None and got[1] < SHAPED and _is_shaped(form, got[0], c):
-            shaped.append((np.log(max(got[1], doubt, CLOSE)) + 0.3 * form.complexity, form, got[0]))
+        if got is not None and got[1] < FORM_SHAPED and _is_shaped(form, got[0], c):
+            shaped.append((np.log(max(got[1], doubt, FORMS_ALIKE)) + 0.3 * form.complexity, form, got[0]))
     shaped.sort(key=lambda s: s[0])
     return [(form, numbers) for _, form, numbers in shaped]
 
 
 def likely(tried: FittedCandidate, fitted: list[tuple[Formula, FittedCandidate]], before: float) -> list[Formula]:
-    """Of formulas that were fitted those that come within `NEAR` of the best, simplest first.
+    """Of formulas that were fitted those that come within `FORMS_NEAR` of the best, simplest first.
 
     before  held-out error without the curve, in noise floors: no law's form is known better than `FORM` of it
     """
     own, grain = rms_of(tried.judge, tried.fit), tried.judge.stage.grain
-    poor = float(np.hypot(POOR**grain * max(own, 1.0), FORM * before if grain == 1.0 else 0.0))
+    poor = float(np.hypot(FORM_POOR**grain * max(own, 1.0), FORM * before if grain == 1.0 else 0.0))
     near = [f for f, _ in fitted if f.error <= poor]
     if not near:
         return []
-    limit = max(min(f.error for f in near), min(own, 1.0)) * (1.0 + NEAR * grain)
+    limit = max(min(f.error for f in near), min(own, 1.0)) * (1.0 + FORMS_NEAR * grain)
     out: list[Formula] = []
     visited = _visited(tried)
     for f in sorted((f for f in near if f.error <= limit), key=lambda f: (f.complexity, f.error)):
         y = values_of(f, visited)
         simpler = [values_of(g, visited) for g in out if g.complexity < f.complexity]
-        if all(np.std(y - other) > SAME * np.std(y) for other in simpler):
+        if all(np.std(y - other) > FORM_SAME * np.std(y) for other in simpler):
             out.append(f)
     return out
 
@@ -160,7 +163,7 @@ def goes_on(ground: CandidateSource, c: Candidate, form: Form, numbers: Array) -
     with np.errstate(all="ignore"):
         slope = np.abs(np.diff(np.broadcast_to(form.value(x, numbers), x.shape)))
     inside = c.basis.reaches(middle)
-    wild = middle[~(slope <= STEEPER * slope[inside].max(initial=0.0)) & ~inside]
+    wild = middle[~(slope <= FORM_STEEPER * slope[inside].max(initial=0.0)) & ~inside]
     return (
         float(max(wild[wild < c.basis.low].max(initial=low), low)),
         float(min(wild[wild > c.basis.high].min(initial=high), high)),
@@ -184,7 +187,7 @@ def _in_simulation(
     """
     c = tried.candidate
     been = c.quantity.visited[np.isfinite(c.quantity.visited)]
-    been = been[np.linspace(0, len(been) - 1, min(len(been), MEANT)).astype(int)]
+    been = been[np.linspace(0, len(been) - 1, min(len(been), FORM_MEAN_VALUES)).astype(int)]
 
     def size(inner: Array) -> float:
         y = form.value(been, np.concatenate([[1.0], inner]))
@@ -192,7 +195,7 @@ def _in_simulation(
 
     def plain(n: Array) -> Array:
         of = size(n[1:])  # 0 where a corner has left the logs
-        return np.concatenate([[n[0] / of if of > NOTHING else 0.0], n[1:]])
+        return np.concatenate([[n[0] / of if of > FORM_NOTHING else 0.0], n[1:]])
 
     reach = goes_on(ground, c, form, numbers)  # what a model says to a reading may lie beyond what the logs show of it
     numbers = np.concatenate([[numbers[0] * size(numbers[1:])], numbers[1:]])

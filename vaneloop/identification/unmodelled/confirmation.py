@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from vaneloop.identification.results import rms_of
-from vaneloop.identification.selection.relative_error_acceptance import HARM, LEAST_FALL, LEAST_USE, MOST_LEFT, UNKNOWN
+from vaneloop.identification.settings import HARM, LEAST_FALL, LEAST_USE, MOST_LEFT, OTHER_AMPLITUDE, UNKNOWN
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate, step_without
@@ -21,8 +21,6 @@ from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.user_models.hysteresis_regressors import swings
 
 __all__ = ["another_confirms", "instead_of", "moves", "stands_before"]
-
-OTHER = 1.5  # times as large: another amplitude
 
 
 def moves(tried: FittedCandidate) -> tuple[Array, Array]:
@@ -54,7 +52,7 @@ def another_confirms(learner: CurveProblem, before: FittedCandidate, tried: Fitt
     small = far <= np.median(far)
     if log.any():
         parts, most = [log == k for k in range(log.max() + 1)], (1.0 - LEAST_USE) ** 2
-    elif not small.all() and np.median(far[~small]) > OTHER * np.median(far[small]) > 0.0:
+    elif not small.all() and np.median(far[~small]) > OTHER_AMPLITUDE * np.median(far[small]) > 0.0:
         parts, most = [small], 1.0 - LEAST_FALL
     else:
         return False

@@ -13,11 +13,20 @@ import numpy as np
 
 from vaneloop.base.curve import FINE, POINTS
 from vaneloop.base.durations import folded, within_no_period
-from vaneloop.identification.candidates.spline_basis import COUNT, FINE_HARMONICS, HARMONICS, Basis, basis_of, waves_of
+from vaneloop.identification.candidates.spline_basis import Basis, basis_of, waves_of
+from vaneloop.identification.settings import (
+    CURVE_SPLINES,
+    FINE_HARMONICS,
+    FINER_SLOPES,
+    HARMONICS,
+    JUMP_SIDES,
+    MOST_SAMPLES,
+    TIME_SPLINES,
+)
 from vaneloop.identification.subsystem import Array, Effect, Stage, size_of
 from vaneloop.identification.unmodelled.regressors import Quantity, difference, quantities
 from vaneloop.identification.unmodelled.spectral_lines import Course
-from vaneloop.identification.user_models.bound_system import MOST_SAMPLES, BoundSystem
+from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.by_log import Logs
 from vaneloop.identification.user_models.exogenous_regressors import TIME, every
 from vaneloop.identification.user_models.hysteresis_regressors import STOPS
@@ -30,10 +39,7 @@ from vaneloop.identification.user_models.terms import COLUMN, INPUT, OUTPUT, Cur
 __all__ = ["Candidate", "UserModelCandidates", "candidates", "on_logs", "with_curves"]
 
 
-IN_TIME = 24  # splines of a curve over time: what swings with time does so often
 JUMP = -1  # of a curve's amplitudes, the one that is of no function of its basis
-FINER = 0.025  # of what unknown parameters may move by: their size as their slopes are taken with, beside a curve
-CROSSES = 0.05  # share of a quantity's values to each side of 0, where a curve of it may jump
 
 
 SHAPES = {
@@ -113,7 +119,7 @@ class Candidate:
         plain = q.stops or q.period or q.name == TIME or {"rising", "falling"} & set(self.shape)
         if self.jump or plain or len(self.basis.bend) < 3:
             return None
-        return replace(self, jump=True) if min(np.mean(x > 0.0), np.mean(x < 0.0)) > CROSSES else None
+        return replace(self, jump=True) if min(np.mean(x > 0.0), np.mean(x < 0.0)) > JUMP_SIDES else None
 
     def shaped(self, shape: Sequence[str]) -> Candidate | None:
         """The same with what is known of its shape; None where its quantity cannot have that."""
@@ -221,7 +227,7 @@ class Candidate:
 
 def usual(q: Quantity) -> int:
     """How many splines a curve of a quantity has."""
-    return IN_TIME if q.name == TIME else COUNT
+    return TIME_SPLINES if q.name == TIME else CURVE_SPLINES
 
 
 def basis_for(q: Quantity, count: int = 0) -> Basis | None:
@@ -229,7 +235,7 @@ def basis_for(q: Quantity, count: int = 0) -> Basis | None:
     values.
     """
     if q.period:
-        return waves_of(q.period, FINE_HARMONICS if count > COUNT else HARMONICS)
+        return waves_of(q.period, FINE_HARMONICS if count > CURVE_SPLINES else HARMONICS)
     count = count or usual(q)
     if q.stops:  # from a radius of 0 to where every way there and back is within it
         return basis_of(0.5 * float(np.ptp(np.concatenate(q.course))) * np.linspace(0.0, 1.0, 20 * count) ** 2, count)
@@ -359,7 +365,9 @@ def with_curves(bound: BoundSystem, laws: Sequence[str], curves: Sequence[tuple[
     stride = max(1, len(bound.t) // MOST_SAMPLES)
     # a gain and a curve nearly make up for each other: what tells them apart is small beside how the model bends over
     # a step of a parameter that is far too large
-    own = tuple(replace(p, scale=(FINER if k < first else 1.0) * p.scale) for k, p in enumerate(bound.stage.parameters))
+    own = tuple(
+        replace(p, scale=(FINER_SLOPES if k < first else 1.0) * p.scale) for k, p in enumerate(bound.stage.parameters)
+    )
     as_here = partial(replace, parameters=own, effects=effects, begins=None, carries=True)
     out.stage = as_here(bound.stage, run=runner.run)
     out.thinned = as_here(bound.thinned, run=lambda thetas: runner.run(thetas, stride))

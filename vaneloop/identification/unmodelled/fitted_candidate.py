@@ -11,8 +11,7 @@ import numpy as np
 from vaneloop.identification.candidates.closed_forms import Formula
 from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known, bounded_step
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
-from vaneloop.identification.selection.likelihood_acceptance import NATS
-from vaneloop.identification.selection.relative_error_acceptance import LEAST_FALL, LEAST_OF_NOISE
+from vaneloop.identification.settings import LEAST_FALL, LEAST_OF_NOISE, LEAST_SETTLED, NATS, SURELY
 from vaneloop.identification.subsystem import Array, Effect, Stage
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
 from vaneloop.identification.unmodelled.spectral_lines import Course
@@ -45,7 +44,6 @@ __all__ = [
 
 Placings = tuple[tuple[Placed, Effect], ...]
 MEASURED = 2  # up to here what is `strange` is of measured or simulated channels alone, as they are
-LEAST_SETTLED = 0.5  # share of the samples that must be left where those that remember what was before are not counted
 
 
 class CandidateSource(Protocol):
@@ -283,7 +281,6 @@ def step_without(tried: FittedCandidate, held: Array) -> Array:
 
 # ---- Held-out errors of curves, and the samples at which they say something
 
-SURELY = 3.0  # standard errors of a sum over blocks
 Blocks = tuple[Array, Array, Array]  # sum of squares, gradient and normal matrix of each block, as `Fit` has them
 
 

@@ -15,6 +15,7 @@ from vaneloop.identification.candidates.closed_forms import Formula, values_of
 from vaneloop.identification.least_squares.broyden import bounded_step
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import rms_of
+from vaneloop.identification.settings import BAND, BAND_DRAWS, VISITED_BINS
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas, likely
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
@@ -26,10 +27,6 @@ if TYPE_CHECKING:
     from plant.model import Second
 
 __all__ = ["Formula", "LearnedLaw", "band_of", "law_of", "range_of"]
-
-DRAWS = 400
-BAND = 0.90
-BINS = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +151,7 @@ def law_of(ground: CandidateSource, before: tuple[LeastSquaresProblem, Fit], tri
     been = np.isin(np.arange(POINTS), np.searchsorted(grid, c.quantity.visited).clip(0, POINTS - 1))
     low, high = _with_formulas(c, y, *band_of(tried, been), been, formulas)
     visited = c.quantity.visited[np.isfinite(c.quantity.visited)]
-    counts, edges = np.histogram(visited, bins=BINS, range=(c.basis.low, c.basis.high))
+    counts, edges = np.histogram(visited, bins=VISITED_BINS, range=(c.basis.low, c.basis.high))
     return LearnedLaw(
         c.name, c.how, c.at, c.quantity.name, c.unit, c.quantity.unit, grid, y, low, high, edges,
         counts / max(counts.sum(), 1), rms_of(*before), rms_of(judge, fit), c.basis.knots,
@@ -179,8 +176,8 @@ def band_of(tried: FittedCandidate, been: Array) -> tuple[Array, Array]:
     prior = fit.prior * scale**2
     n = judge.n_blocks
     rng = np.random.default_rng(0)
-    weights = rng.multinomial(n, np.full(n, 1.0 / n), DRAWS)
-    known = rng.standard_normal((DRAWS, len(prior))) * np.sqrt(prior)
+    weights = rng.multinomial(n, np.full(n, 1.0 / n), BAND_DRAWS)
+    known = rng.standard_normal((BAND_DRAWS, len(prior))) * np.sqrt(prior)
     at = judge.stage.index()[c.name]
     bounds = tuple(b[fit.free] for b in judge.bounds())
     mine = np.flatnonzero((fit.free >= at.start) & (fit.free < at.stop))

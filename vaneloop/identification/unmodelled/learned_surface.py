@@ -11,16 +11,14 @@ from plant.model import Second
 from vaneloop.base.curve import SIDE
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import rms_of
+from vaneloop.identification.settings import SHOWN_PLACES, SHOWN_SAMPLES, VISITED_BINS
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
-from vaneloop.identification.unmodelled.learned_law import BINS, LearnedLaw, band_of, range_of
+from vaneloop.identification.unmodelled.learned_law import LearnedLaw, band_of, range_of
 from vaneloop.identification.unmodelled.surface_candidates import SurfaceCandidate
 from vaneloop.identification.unmodelled.surface_closed_forms import Ends, Product, likely_products
 
 __all__ = ["LearnedSurface", "surface_law_of"]
-
-SHOWN = 9  # places each way of its JSON, as many as of its curve
-SAMPLES = 1_000  # places where the logs have been that a page shows
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,8 +68,8 @@ class LearnedSurface(LearnedLaw):
         )
 
     def more(self) -> dict[str, Any]:
-        """The surface at `SHOWN` places each way."""
-        some = np.linspace(0, SIDE - 1, SHOWN).astype(int)
+        """The surface at `SHOWN_PLACES` places each way."""
+        some = np.linspace(0, SIDE - 1, SHOWN_PLACES).astype(int)
         grids = {"values": self.values, "lowest": self.lowest, "highest": self.highest, "within": self.within}
         return {
             "second": self.second, "second_unit": self.second_unit, "middle": self.middle,
@@ -109,8 +107,8 @@ def surface_law_of(before: tuple[LeastSquaresProblem, Fit], tried: FittedCandida
     values, (low, high), (x, across) = table(amplitudes), band_of(tried, within), c.grids
     good = np.isfinite(c.quantity.visited) & np.isfinite(c.other.visited)
     both = np.stack([c.quantity.visited[good], c.other.visited[good]])
-    some = both[:, np.linspace(0, both.shape[1] - 1, min(both.shape[1], SAMPLES)).astype(int)]
-    counts, edges = np.histogram(both[0], bins=BINS, range=(c.basis.low, c.basis.high))
+    some = both[:, np.linspace(0, both.shape[1] - 1, min(both.shape[1], SHOWN_SAMPLES)).astype(int)]
+    counts, edges = np.histogram(both[0], bins=VISITED_BINS, range=(c.basis.low, c.basis.high))
     middle = float(np.median(both[1]))
     k = int(np.argmin(np.abs(across - middle)))
     return LearnedSurface(

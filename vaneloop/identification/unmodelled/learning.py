@@ -17,14 +17,32 @@ import numpy as np
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.regimes import agrees
 from vaneloop.identification.results import rms_of
-from vaneloop.identification.selection.relative_error_acceptance import (
+from vaneloop.identification.selection.relative_error_acceptance import score
+from vaneloop.identification.settings import (
+    BENDS_TRIED,
     BETTER,
+    CURVES_FINISHED,
+    CURVES_QUICK,
+    FAR_OFF,
+    FEW_STEPS,
+    FINE_SPLINES,
+    FORMULAS_WITHIN,
     HARM,
+    LAG_TIMES,
+    LEAST_LAG_GAIN,
+    MANY_STEPS,
+    MAY_CATCH_UP,
+    MOST_CURVES,
+    MOST_HYSTERESES,
     MOST_LEFT,
+    MOST_OVER_TIME,
+    MOST_PLAINER,
     PER_PARAMETER,
+    PERIOD_TURNS,
     RIVAL,
+    SCREENED_BEND,
+    SURE_BY_HELD_OUT,
     UNKNOWN,
-    score,
 )
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
@@ -55,27 +73,12 @@ from vaneloop.identification.unmodelled.parametric_preference import (
 )
 from vaneloop.identification.unmodelled.parametric_substitution import tell_each_by_its_formula
 from vaneloop.identification.unmodelled.problem import CurveProblem
-from vaneloop.identification.unmodelled.screening import SCREENED, screened, smoothed
+from vaneloop.identification.unmodelled.screening import screened, smoothed
 from vaneloop.identification.unmodelled.surface_search import put_surface
 from vaneloop.identification.user_models.exogenous_regressors import TIME
 from vaneloop.identification.user_models.hysteresis_regressors import dissipates
 
 __all__ = ["CurveSearch"]
-
-MOST_CURVES = 2
-WIGGLES = (0.1, SCREENED, 5.0)  # standard deviations of a curve's first bend, in its usual size, that are tried
-QUICK, FINISHED = 24, 5  # candidates that are fitted for a few steps, and of these to the end
-FEW_STEPS, MANY_STEPS = 3, 12  # of the former; on an excerpt more would only suit the excerpt
-FAR_OFF = 5.0  # noise floors: a model that is further off has a crooked way to go, the more so in the right place
-SURE = 3  # of the latter that are chosen by data left out
-SLIPPING = 2  # hystereses that are, whatever data left out say: what promises most tells crank and rings hardly apart
-OVER_TIME = 2  # of these of time: with its many splines it imitates much
-PLAINER = 2  # more that are fitted to the end, where they are plainer than the best; and as many at their place itself
-NEAR = 0.25  # log error after a few steps within which another quantity may still do as well
-TIMES, STEP = (1.8, 1.3, 1.1, 1.03), 0.002  # by which a lag is changed; log error by which a change must help
-TURNS = (0.3, 0.1)  # by which a period is changed, in turns over the whole way
-FORMULAS = 0.5  # log error by which a curve may be worse than the best, and a formula or a jump still tell it better
-SPLINES = 28  # of the best finalists where they still fail
 
 
 class CurveSearch(CurveProblem):
@@ -144,7 +147,7 @@ class CurveSearch(CurveProblem):
         """A curve with the lag that suits it best, and without what parameters of the model can have; and why it is not
         learned, "" if it is: it harms a test log, and no formula that does as well is harmless.
         """
-        best = self._settled(current, self._with_its_lag(current, tried, TIMES[1:]))
+        best = self._settled(current, self._with_its_lag(current, tried, LAG_TIMES[1:]))
         why = self.harmful(current, best)
         if why or self.fails(best):
             best.formulas = fitted_formulas(self.ground, best)
@@ -219,7 +222,7 @@ class CurveSearch(CurveProblem):
         """
         best = min(good, key=lambda t: left[t.candidate.name])
         costs = [left, {t.candidate.name: 0.5 * float(np.log(t.fit.cost.sum() / t.judge.n)) for t in good}]
-        close = [t for t in good if any(c[t.candidate.name] <= c[best.candidate.name] + FORMULAS for c in costs)]
+        close = [t for t in good if any(c[t.candidate.name] <= c[best.candidate.name] + FORMULAS_WITHIN for c in costs)]
         close += [t for t in at_its_place(before, good) if t not in close]
         first = close
         if not (self.fails(best) or self.harmful(before, best)):
@@ -288,7 +291,7 @@ class CurveSearch(CurveProblem):
         """The curve with the lag that suits it best, by such ``steps`` up and down; or with the period."""
         q = best.candidate.quantity
         if q.period:  # by so many turns over the whole way
-            steps = [1.0 + turns * q.period / q.span for turns in TURNS]
+            steps = [1.0 + turns * q.period / q.span for turns in PERIOD_TURNS]
         for times in steps if q.slower is not None else ():
             for factor in (times, 1.0 / times):
                 while (more := self._slower(current, best, factor)) is not None:
@@ -304,7 +307,7 @@ class CurveSearch(CurveProblem):
         worse = score(judge, now) - score(judge, was)
         # within the noise the score does not tell: what is left there still does
         falls = 0.5 * float(np.log(was.held_out.sum() / now.held_out.sum()))
-        return more if worse < -STEP or (worse < STEP and falls > STEP) else None
+        return more if worse < -LEAST_LAG_GAIN or (worse < LEAST_LAG_GAIN and falls > LEAST_LAG_GAIN) else None
 
     def _begun(self, tried: FittedCandidate, candidate: Candidate) -> Array:
         """Parameters from which a candidate begins that is nearly what has been fitted."""
@@ -341,33 +344,33 @@ class CurveSearch(CurveProblem):
 
     def _finalists(self, current: FittedCandidate) -> list[FittedCandidate]:
         """The candidates that promise most, fitted; best first."""
-        near, (bare, promising) = current.slopes(beside=False), screened(self, current, QUICK, TIMES[0])
+        near, (bare, promising) = current.slopes(beside=False), screened(self, current, CURVES_QUICK, LAG_TIMES[0])
         quick: list[FittedCandidate] = []
         if self.faint and not (promising and promises(bare, promising[0][0])):
             return []
         steps = MANY_STEPS if not self.ground.noise_known and bare > FAR_OFF**2 * self.judge.n else FEW_STEPS
-        few = lambda p: self.fitted(current, p[1], SCREENED, p[2], steps, True, near)  # noqa: E731
+        few = lambda p: self.fitted(current, p[1], SCREENED_BEND, p[2], steps, True, near)  # noqa: E731
         for k, t in enumerate(self.each(few, promising)):
             quick.append(t)
-            self.progress((k + 1.0) / (QUICK + FINISHED + 1.0))
+            self.progress((k + 1.0) / (CURVES_QUICK + CURVES_FINISHED + 1.0))
         short = len(quick[0].judge.stage.t) < len(self.judge.stage.t) if quick else False
         if short and not all(self.fails(t) for t in quick):  # where an excerpt does not tell them apart, all samples do
-            quick = [self.fitted(current, t.candidate, SCREENED, t.fit.theta, 1) for t in quick]
+            quick = [self.fitted(current, t.candidate, SCREENED_BEND, t.fit.theta, 1) for t in quick]
         quick.sort(key=lambda t: score(t.judge, t.fit))
         self.ranked.append(list(quick))
         quick, done = one_constant(quick), []
-        over_time = [t for t in quick if t.candidate.quantity.name == TIME][OVER_TIME:]
+        over_time = [t for t in quick if t.candidate.quantity.name == TIME][MOST_OVER_TIME:]
         quick = [t for t in quick if t not in over_time]
         # of what varies slowly a block that is left out says little at one smoothness: some go on by how well they fit
-        first, others = quick[:SURE], quick[SURE:]
+        first, others = quick[:SURE_BY_HELD_OUT], quick[SURE_BY_HELD_OUT:]
         others.sort(key=lambda t: float(t.fit.cost.sum()))
-        chosen = [*first, *others[: FINISHED - SURE]]
+        chosen = [*first, *others[: CURVES_FINISHED - SURE_BY_HELD_OUT]]
         # a short excerpt has too few turns for what slips: the hystereses that promised most go on, too
-        slipping = [c.name for _, c, _ in promising if c.quantity.stops][:SLIPPING]
+        slipping = [c.name for _, c, _ in promising if c.quantity.stops][:MOST_HYSTERESES]
         chosen += [t for t in quick if t.candidate.name in slipping and t not in chosen]
         for k, t in enumerate(self.each(lambda t: self._finished(current, t), chosen)):
             done.append(t)
-            self.progress((QUICK + k + 1.0) / (QUICK + len(chosen) + 1.0))
+            self.progress((CURVES_QUICK + k + 1.0) / (CURVES_QUICK + len(chosen) + 1.0))
         if self.faint and done:
             nearest = min(done, key=lambda t: rms_of(t.judge, t.fit))
             grain = grain_of(nearest.judge, nearest.fit)
@@ -375,21 +378,21 @@ class CurveSearch(CurveProblem):
         done = self.ordered(done)
         if done:  # what is plainer may say the same
             leader, have = done[0].candidate, {t.candidate.name for t in done}
-            reach = min(score(t.judge, t.fit) for t in quick) + NEAR
+            reach = min(score(t.judge, t.fit) for t in quick) + MAY_CATCH_UP
             plainer = [t for t in quick if t.candidate.name not in have and plain(t.candidate) < plain(leader)]
             alike = {t.candidate.name for t in plainer if channel_of(t.candidate) == channel_of(leader)}
-            home = sorted(at_its_place(current, plainer), key=lambda t: float(t.fit.cost.sum()))[:PLAINER]
+            home = sorted(at_its_place(current, plainer), key=lambda t: float(t.fit.cost.sum()))[:MOST_PLAINER]
             plainer = [t for t in plainer if t.candidate.name in alike or score(t.judge, t.fit) < reach]
             plainer.sort(key=lambda t: (t.candidate.name not in alike, t.candidate.at != leader.at))
-            more = dict.fromkeys([*plainer[:PLAINER], *home])
+            more = dict.fromkeys([*plainer[:MOST_PLAINER], *home])
             done = self.ordered([*done, *self.each(lambda t: self._finished(current, t), more)])
         if done and self.fails(done[0]):  # a curve may turn more often than its splines
             best = self.score(done[0], done)
-            close = [t for t in done if self.score(t, done) < best + NEAR or without_its_lag(t, done[0])]
+            close = [t for t in done if self.score(t, done) < best + MAY_CATCH_UP or without_its_lag(t, done[0])]
             more_splines = zip(close, self.each(lambda t: self._finer(current, t), close), strict=True)
             finer = {t: f for t, f in more_splines if f is not None}
             home = at_its_place(current, done)
-            close = [t for t in done if t in home or self.score(t, done) < best + FORMULAS]
+            close = [t for t in done if t in home or self.score(t, done) < best + FORMULAS_WITHIN]
             jumping = [j for j in self.each(lambda t: self._jumping(current, t), close) if j is not None]
             coarse = [t for t in done if t in finer and self.worth(t, finer[t])]  # a second law would patch them
             done = self.ordered([*(t for t in done if t not in coarse), *finer.values(), *jumping])
@@ -400,17 +403,17 @@ class CurveSearch(CurveProblem):
     def _finished(self, current: FittedCandidate, quick: FittedCandidate) -> FittedCandidate:
         """A candidate fitted to the end, as smooth and with the lag that suits it best."""
         begin = quick.fit if len(quick.judge.stage.t) == len(self.judge.stage.t) else quick.fit.theta
-        done = smoothed(self, current, quick.candidate, begin, WIGGLES)
+        done = smoothed(self, current, quick.candidate, begin, BENDS_TRIED)
         # what was before the log is no matter of the curve; of own models laws with names remember it as well
         if self.ground.noise_known and (settled := done.forgotten()) is not None:
-            done = smoothed(self, current, replace(done.candidate, settled=settled), done.fit, WIGGLES, done.wiggle)
-        return self._with_its_lag(current, done, TIMES[:1])
+            done = smoothed(self, current, replace(done.candidate, settled=settled), done.fit, BENDS_TRIED, done.wiggle)
+        return self._with_its_lag(current, done, LAG_TIMES[:1])
 
     def _finer(self, current: FittedCandidate, coarse: FittedCandidate) -> FittedCandidate | None:
-        """The same curve with `SPLINES` splines."""
-        if (fine := coarse.candidate.finer(SPLINES)) is None:
+        """The same curve with `FINE_SPLINES` splines."""
+        if (fine := coarse.candidate.finer(FINE_SPLINES)) is None:
             return None
-        return self.fitted(current, fine, WIGGLES[-1], self._begun(coarse, fine), 12, slopes=coarse.slopes())
+        return self.fitted(current, fine, BENDS_TRIED[-1], self._begun(coarse, fine), 12, slopes=coarse.slopes())
 
     def _jumping(self, current: FittedCandidate, smooth: FittedCandidate) -> FittedCandidate | None:
         """The same curve with a jump where its quantity is 0."""

@@ -16,15 +16,12 @@ import numpy as np
 
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.selection.likelihood_acceptance import (
-    LEAST_SHARE,
-    NATS,
-    SPREADS,
     LikelihoodAcceptance,
     correlation_of,
     gain,
     rival_nats,
 )
-from vaneloop.identification.selection.relative_error_acceptance import RIVAL
+from vaneloop.identification.settings import LEAST_SHARE, NATS, RIVAL, SPREADS
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.fitted_candidate import CandidateSource
 

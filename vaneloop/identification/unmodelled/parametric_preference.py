@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from vaneloop.base.side_by_side import side_by_side
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.selection.likelihood_acceptance import correlation_of, rival_nats
-from vaneloop.identification.selection.relative_error_acceptance import MOST_LEFT
+from vaneloop.identification.settings import FORMULA_MAY_EARN, MOST_LEFT, NOT_INSTEAD
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
 from vaneloop.identification.unmodelled.fitted_candidate import MEASURED, CandidateSource, FittedCandidate, strange
 from vaneloop.identification.unmodelled.problem import CurveProblem
@@ -27,9 +27,6 @@ __all__ = [
     "said_first",
     "without_memory",
 ]
-
-NEAR = 0.25  # log error within which a curve that does not earn its place may do so by a formula
-FAR = 0.5  # log error from which what harms no test log is not taken instead of what does
 
 
 def in_its_place(ground: CandidateSource, tried: FittedCandidate) -> list[FittedCandidate]:
@@ -62,7 +59,10 @@ def earning_by_formula(
     place itself, those of which a formula does; none of what remembers. A block that alone has been somewhere says
     nothing of splines there, and much of a formula.
     """
-    reach, home = min((learner.score(t, among) for t in among), default=0.0) + NEAR, at_its_place(before, poor)
+    reach, home = (
+        min((learner.score(t, among) for t in among), default=0.0) + FORMULA_MAY_EARN,
+        at_its_place(before, poor),
+    )
     near = [t for t in poor if t in home or learner.score(t, among) < reach]
     near = [t for t in near if not t.candidate.quantity.remembers]
     said = all_in_their_place(learner.ground, near)
@@ -77,7 +77,7 @@ def harmless(
     left  what orders them, by name
     """
     fine = [t for t in good if any(not learner.harmful(before, f) for f in (t, *(t.loose or ())))]
-    reach = min(left[t.candidate.name] for t in good) + FAR
+    reach = min(left[t.candidate.name] for t in good) + NOT_INSTEAD
     return fine if any(left[t.candidate.name] < reach for t in fine) else good
 
 

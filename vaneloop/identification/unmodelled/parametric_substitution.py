@@ -18,7 +18,7 @@ from vaneloop.base.forms import FORMS
 from vaneloop.identification.candidates.closed_forms import Formula, text_of
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import rms_of
-from vaneloop.identification.selection.relative_error_acceptance import HARM, PER_PARAMETER, RIVAL
+from vaneloop.identification.settings import HARM, LEAST_PARAMETER_LEFT, PER_PARAMETER, RIVAL
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import effect_of, fitted_formulas, goes_on
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
@@ -28,8 +28,6 @@ from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.user_models.terms import runs
 
 __all__ = ["more_left", "spoken", "takes_mean_back", "tell_each_by_its_formula"]
-
-LEAST = 0.1  # share of a parameter that may be left when a formula takes its mean back
 
 
 def spoken(
@@ -128,7 +126,7 @@ def takes_mean_back(level: float, numbers: Array, own: Array, place: int) -> boo
     mean m, p (1 + f - m) = p (1 - m) (1 + f / (1 - m)). Whether enough of the parameter is left then.
     """
     kept = 1.0 + level
-    if level and kept < LEAST:
+    if level and kept < LEAST_PARAMETER_LEFT:
         return False
     if level:
         numbers[0] /= kept

@@ -12,13 +12,8 @@ from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import StageDiagnosis
 from vaneloop.identification.selection.likelihood_acceptance import correlation_of
-from vaneloop.identification.selection.relative_error_acceptance import (
-    HARM,
-    LEAST_USE,
-    RelativeErrorAcceptance,
-    score,
-    worth,
-)
+from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance, score, worth
+from vaneloop.identification.settings import HARM, LEAST_USE
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
 from vaneloop.identification.unmodelled.fitted_candidate import (

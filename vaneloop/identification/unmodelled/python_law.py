@@ -14,6 +14,7 @@ import numpy as np
 
 from vaneloop.base.errors import InputError
 from vaneloop.base.forms import FORMS
+from vaneloop.identification.settings import LAW_TEST_VALUES, TABLE_POINTS
 from vaneloop.identification.user_models.exogenous_regressors import TIME, sides_of
 
 if TYPE_CHECKING:
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
 
 __all__ = ["python_law"]
 
-POINTS = 33  # of a table
-HELD = 9  # values that the file's test holds
 
 FILE = '''"""{sentence}
 
@@ -112,7 +111,7 @@ def python_law(law: LearnedLaw, system: System | None = None) -> str:
     along = period > 0.0 and law.channel != TIME  # what the file is given is the whole way, not that within a period
     within = f"q % {period!r}" if along else f"min(max(q, {low!r}), {high!r})"
     of = f"{law.channel}, of which each {period:.6g} {law.of_unit.strip('-')} are alike" if along else law.of
-    places = np.linspace(low, high, HELD, endpoint=not along)
+    places = np.linspace(low, high, LAW_TEST_VALUES, endpoint=not along)
     held = [(float(q), float(curve["curve"](q))) for q in places]  # type: ignore[operator]
     goes = f", and goes on to [{low:.6g}, {high:.6g}]" if law.spoken else ""
     return FILE.format(
@@ -134,13 +133,13 @@ def _code(law: LearnedLaw) -> tuple[str, str, str]:
             constants += f"LEVEL = {level!r}  # the model's own parameter has the mean\n"
             code = f"{code} + LEVEL"
         return code, constants, f.text.replace(law.of, "q")
-    places = np.linspace(0, len(law.x) - 1, POINTS).astype(int)
+    places = np.linspace(0, len(law.x) - 1, TABLE_POINTS).astype(int)
     x, y = (tuple(float(f"{v:.9g}") for v in a[places]) for a in (law.x, law.y))
-    step = (x[-1] - x[0]) / (POINTS - 1)
+    step = (x[-1] - x[0]) / (TABLE_POINTS - 1)
     constants = f"Y = {y!r}\n"
-    at = f"min(int((q - {x[0]!r}) / {step!r}), {POINTS - 2})"
+    at = f"min(int((q - {x[0]!r}) / {step!r}), {TABLE_POINTS - 2})"
     code = f"Y[{at}] + (Y[{at} + 1] - Y[{at}]) * ((q - {x[0]!r}) / {step!r} - {at})"
-    return code, constants, f"a table of {POINTS} points, straight between them (no formula fits it)"
+    return code, constants, f"a table of {TABLE_POINTS} points, straight between them (no formula fits it)"
 
 
 def _own_law(law: LearnedLaw, system: System) -> Mapping[str, str]:

@@ -8,13 +8,12 @@ import re
 
 import numpy as np
 
+from vaneloop.identification.settings import SURFACE_TEST_VALUES, TABLE_POINTS
 from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
 from vaneloop.identification.unmodelled.surface_closed_forms import Product
 
 __all__ = ["python_surface"]
 
-POINTS = 33  # of a table, each way
-HELD = 4  # values each way that the file's test holds
 
 FILE = '''"""{sentence}
 
@@ -56,7 +55,7 @@ def python_surface(law: LearnedSurface) -> str:
     code, constants, equation = _code(law, low, high)
     space: dict[str, object] = {}
     exec(f"import math\n{constants}\ndef surface(q1, q2):\n    {code}", space)  # our own text
-    places = [np.linspace(a, b, HELD) for a, b in zip(low, high, strict=True)]
+    places = [np.linspace(a, b, SURFACE_TEST_VALUES) for a, b in zip(low, high, strict=True)]
     held = [(float(p), float(q), float(space["surface"](p, q))) for p in places[0] for q in places[1]]  # type: ignore[operator]
     sentence = law.sentence().rstrip(".")
     return FILE.format(
@@ -82,9 +81,13 @@ def _code(law: LearnedSurface, low: tuple[float, float], high: tuple[float, floa
         names = {law.of: "q1", law.second: "q2"}
         equation = re.sub(r"\b(" + "|".join(map(re.escape, names)) + r")\b", lambda m: names[m.group(1)], best.text)
         return code, constants, equation
-    some = np.linspace(0, len(law.x) - 1, POINTS).astype(int)
+    some = np.linspace(0, len(law.x) - 1, TABLE_POINTS).astype(int)
     rows = [tuple(float(f"{v:.9g}") for v in row) for row in law.values[np.ix_(some, some)]]
     constants = "Y = (\n" + "".join(f"    {row!r},\n" for row in rows) + ")\n"
-    step = tuple((b - a) / (POINTS - 1) for a, b in zip(low, high, strict=True))
-    code = TABLE.format(low=low, step=step, last=POINTS - 2)
-    return code, constants, f"a table of {POINTS} x {POINTS} points, straight between them (no formula fits it)"
+    step = tuple((b - a) / (TABLE_POINTS - 1) for a, b in zip(low, high, strict=True))
+    code = TABLE.format(low=low, step=step, last=TABLE_POINTS - 2)
+    return (
+        code,
+        constants,
+        f"a table of {TABLE_POINTS} x {TABLE_POINTS} points, straight between them (no formula fits it)",
+    )

@@ -9,7 +9,16 @@ from itertools import combinations
 import numpy as np
 
 from vaneloop.base.durations import folded
-from vaneloop.identification.selection.relative_error_acceptance import FORM
+from vaneloop.identification.settings import (
+    DERIVATIVE_PLACES,
+    DERIVATIVE_STEP,
+    FORM,
+    LAG_PLACES,
+    LONGEST_LAG,
+    MOST_DIFFERENCES,
+    NOISY_DIFFERENCE,
+    SHORTEST_LAG,
+)
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.data import noise_of_channel
@@ -20,14 +29,9 @@ from vaneloop.identification.user_models.motion import MOTION, highest_frequency
 from vaneloop.identification.user_models.system import Record
 from vaneloop.identification.user_models.terms import COLUMN, INPUT, OUTPUT
 
-__all__ = ["LAGS", "LONGEST", "SHORTEST", "Quantity", "difference", "quantities"]
+__all__ = ["Quantity", "difference", "quantities"]
 
-LAGS = (1.0 / 6.0, 1.0 / 2.0, 5.0 / 6.0)  # of the way, in logarithms, from the shortest lag tried to the longest
-SHORTEST, LONGEST = 3.0, 0.125  # samples; of the shortest log
 NO_KIND = ("", "-", "1", "%")  # units that do not say that two quantities are of one kind
-EACH = 2  # differences for each state and input at most: a chain of n has n - 1 links, and n to what is about it
-NOISY = 0.1  # share of a difference's spread that noise may be
-LOOKED_AT, MOVED = 5, 1e-3  # places at which the model's derivatives are looked at; of a channel's spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +126,7 @@ def _differences(bound: BoundSystem, values: Array, have: Sequence[Quantity]) ->
     channels = [q for q in have if q.of < OUTPUT or q.name in s.inputs]
     channels.sort(key=lambda q: declared.index(q.name))
     pairs = [(a, b) for a, b in combinations(channels, 2) if a.unit == b.unit and a.unit not in NO_KIND]
-    if len(pairs) > (most := EACH * len(channels)):
+    if len(pairs) > (most := MOST_DIFFERENCES * len(channels)):
         together = _acting(bound, values, {q.name: q.visited for q in channels})
         pairs = sorted(pairs, key=lambda p: (p[0].name, p[1].name) not in together)[:most]
     out: list[Quantity] = []
@@ -142,7 +146,7 @@ def difference(bound: BoundSystem, a: Array, b: Array) -> Array:
     """
     d = np.asarray(a - b, dtype=float)
     for r, at in zip(bound.data.records, bound.data.logs.values(), strict=True):
-        if noise_of_channel(d[at]) > NOISY * np.nanstd(d[at]):
+        if noise_of_channel(d[at]) > NOISY_DIFFERENCE * np.nanstd(d[at]):
             cutoff = highest_frequency(["d"], [Record(r.name, r.t, {"d": d[at]})])
             d[at] = low_pass(r.t, d[at], cutoff)
     return d
@@ -167,12 +171,12 @@ def _acting(bound: BoundSystem, values: Array, visited: Mapping[str, Array]) -> 
         u = [point.get(name, 0.0) for name in code.U._fields]
         return np.atleast_1d(np.asarray(s.model(code.X(*[point[n] for n in s.states]), code.U(*u), p), dtype=float))
 
-    places = np.linspace(0, len(bound.t) - 1, LOOKED_AT + 2).astype(int)[1:-1]
-    signs = np.zeros((LOOKED_AT, len(visited), max(len(s.states), 1)))
+    places = np.linspace(0, len(bound.t) - 1, DERIVATIVE_PLACES + 2).astype(int)[1:-1]
+    signs = np.zeros((DERIVATIVE_PLACES, len(visited), max(len(s.states), 1)))
     for k, at in enumerate(places if s.kind in ("simulate", "closed_loop") else ()):
         point = {name: float(v[at]) for name, v in visited.items()}
         for j, (name, v) in enumerate(visited.items()):
-            by = MOVED * max(float(np.nanstd(v)), 1e-300)
+            by = DERIVATIVE_STEP * max(float(np.nanstd(v)), 1e-300)
             try:
                 with np.errstate(all="ignore"):
                     signs[k, j] = np.sign(rates({**point, name: point[name] + by}) - rates(point))
@@ -195,7 +199,7 @@ def _remembering(bound: BoundSystem, shared: set[str]) -> list[Quantity]:
         return tuple(data.column(k, name) for k in range(len(data.records)))
 
     step = max(float(np.median(np.diff(r.t))) for r in data.records)
-    shortest, longest = SHORTEST * step, LONGEST * min(float(r.t[-1] - r.t[0]) for r in data.records)
+    shortest, longest = SHORTEST_LAG * step, LONGEST_LAG * min(float(r.t[-1] - r.t[0]) for r in data.records)
 
     def slow(name: str, unit: str, tau: float) -> Quantity | None:
         if not 0.5 * shortest < tau < 2.0 * longest:
@@ -209,7 +213,7 @@ def _remembering(bound: BoundSystem, shared: set[str]) -> list[Quantity]:
         if not any(np.ptp(c) > 0.0 for c in course(name)):
             continue
         if longest > 4.0 * shortest:
-            out += [q for z in LAGS if (q := slow(name, unit, shortest * (longest / shortest) ** z)) is not None]
+            out += [q for z in LAG_PLACES if (q := slow(name, unit, shortest * (longest / shortest) ** z)) is not None]
         if name != s.velocity:
             radii = 0.5 * np.concatenate(course(DISTANCE + name))
             out.append(Quantity(STOPS + name, unit, COLUMN, radii, course(name)))

@@ -12,6 +12,15 @@ from vaneloop.base.durations import within_no_period
 from vaneloop.identification.least_squares.broyden import bounded_step
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.selection.screening import Linearisation
+from vaneloop.identification.settings import (
+    MOST_CROOKED,
+    PERIODS_OFF,
+    PROBE_SIZE,
+    PROMISE_KEPT,
+    SCREEN_DAMPING,
+    SCREEN_STEPS,
+    SCREENED_BEND,
+)
 from vaneloop.identification.subsystem import Array, Effect
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate, Placings, channel_of, stands, strange
@@ -19,13 +28,9 @@ from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.unmodelled.spectral_lines import Course, Lines, periods_along
 from vaneloop.identification.user_models.exogenous_regressors import TIME
 
-__all__ = ["SCREENED", "Step", "best_step", "screened", "smoothed", "starts_of"]
+__all__ = ["Step", "best_step", "screened", "smoothed", "starts_of"]
 
-FEW = 8  # steps of a fit
-OFF = (0.0, -0.25, 0.25)  # turns over the whole way by which a period along a channel may be off
-PROBE, SMALL = "probe", 1e-2  # a constant by which a place is moved to see what a swing there would do
-KEPT = 0.5  # of what slopes promise that a step must bring; else a place is too crooked to be ranked by it
-CROOKED = 24  # of such candidates, those that are promised most are fitted for `FEW` steps
+PROBE = "probe"
 Promise = tuple[float, Candidate, Array]  # what a candidate would leave, and parameters to begin from
 Starts = Sequence[tuple[Array, Linearisation]]
 
@@ -75,12 +80,12 @@ def _straightened(
     """
     out = sorted((p for p, _ in steps), key=lambda o: o[0])
     limit = out[min(many, len(out)) - 1][0] if out else 0.0
-    poor = [(said, p) for p, said in steps if said < limit and bare - p[0] < KEPT * (bare - said)]
-    chosen = _one_lag(p for _, p in sorted(poor, key=lambda o: o[0]))[:CROOKED]
+    poor = [(said, p) for p, said in steps if said < limit and bare - p[0] < PROMISE_KEPT * (bare - said)]
+    chosen = _one_lag(p for _, p in sorted(poor, key=lambda o: o[0]))[:MOST_CROOKED]
 
     def fitted(p: Promise) -> Promise:
         begin = p[2] if p[0] < bare else np.append(current.fit.theta, np.zeros(len(p[2]) - len(current.fit.theta)))
-        few = learner.fitted(current, p[1], SCREENED, begin, FEW, True).fit
+        few = learner.fitted(current, p[1], SCREENED_BEND, begin, SCREEN_STEPS, True).fit
         return min(p, (float(few.cost.sum()), p[1], few.theta), key=lambda o: o[0])
 
     gone = {id(p) for p in chosen}
@@ -141,8 +146,8 @@ def _in_time(
         if c.how.endswith("times"):
             whole = replace(c, name=PROBE, mean=True, untold=())
             values = np.zeros(len(whole.kept))
-            values[0] = SMALL
-            curves: Placings = (*current.curves, (whole.placed(), whole.effect(SCREENED)))
+            values[0] = PROBE_SIZE
+            curves: Placings = (*current.curves, (whole.placed(), whole.effect(SCREENED_BEND)))
             moved = ground.courses(curves, np.concatenate([fit.theta, values]))
             periods = lines.found([m.error - w.error for m, w in zip(moved, courses, strict=True)])
             if not c.how.startswith("output"):
@@ -159,7 +164,7 @@ def _promise(
 
     Far from the truth slopes say nothing of data left out: that is asked when the candidate has been fitted.
     """
-    effect = candidate.effect(SCREENED)
+    effect = candidate.effect(SCREENED_BEND)
     judge = learner.judge_of((), (*current.curves, (candidate.placed(), effect)), True)
     slips = candidate.quantity.stops  # fitted to the end whatever it promises, from the fit that it follows
     steps = [best_step(current.fit, effect, judge, *s, cut_off=slips) for s in (starts[:1] if slips else starts)]
@@ -168,17 +173,17 @@ def _promise(
         # along what the model simulates a wave shifts its own phase: one whole step may leave more than none
         begin = np.append(current.fit.theta, np.zeros(len(effect.parameters)))
         best = (left, candidate, theta)
-        for turns in OFF:  # nor is the model where it was, so that its period is not quite the one that was found
+        for (
+            turns
+        ) in PERIODS_OFF:  # nor is the model where it was, so that its period is not quite the one that was found
             c = candidate.slower(1.0 + turns * candidate.quantity.period / candidate.quantity.span) or candidate
-            few = learner.fitted(current, c, SCREENED, begin, FEW, True).fit
+            few = learner.fitted(current, c, SCREENED_BEND, begin, SCREEN_STEPS, True).fit
             best = min(best, (float(few.cost.sum()), c, few.theta), key=lambda o: o[0])
         return best, best[0]
     return (left, candidate, theta), promised
 
 
 # ---- The first step that a candidate is ranked by: from the model's own parameters, by the slopes there, simulated
-
-DAMPED = (0.003, 0.03, 0.3)  # of the diagonal of the slopes' equations: their steps are simulated
 
 
 class Step(NamedTuple):
@@ -224,10 +229,10 @@ def best_step(
     prior = np.concatenate([fit.prior, 3.0 / tolerance**2]) * scale**2
     deviation = (theta - judge.stage.neutral())[free] / scale
     a, g = normals.sum(axis=0) + np.diag(prior + 1e-9), gradients.sum(axis=0) - prior * deviation
-    trials, promised = np.repeat(theta[None], len(DAMPED), axis=0), np.inf
+    trials, promised = np.repeat(theta[None], len(SCREEN_DAMPING), axis=0), np.inf
     here = float(judge.totals(slopes.error[None], theta[None])[0])
     low, high = judge.bounds()
-    for row, damping in zip(trials, DAMPED, strict=True):
+    for row, damping in zip(trials, SCREEN_DAMPING, strict=True):
         stiff, room = a + damping * np.diag(np.diag(a)), [(b - theta)[free] / scale for b in (low, high)]
         step = np.linalg.solve(stiff, g)
         if not cut_off and np.any((step < room[0]) | (step > room[1])):
@@ -242,12 +247,10 @@ def best_step(
 
 # ---- How much a curve or a surface may bend: as much as its held-out error says
 
-SCREENED = 1.0  # of the standard deviations of a first bend that are tried, the one with which candidates are screened
-
 
 def smoothed(
     learner: CurveProblem, current: FittedCandidate, candidate: Candidate, begin: Array | Fit, wiggles: Sequence[float],
-    first: float = SCREENED,
+    first: float = SCREENED_BEND,
 ) -> FittedCandidate:  # fmt: skip
     """A candidate fitted to the end, as smooth as suits it best: from the ``first`` of ``wiggles`` smoother, else less
     so, while that helps, each from where the last one ended.

@@ -16,26 +16,35 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from vaneloop.identification.candidates.spline_basis import FINE_HARMONICS, HARMONICS
+from vaneloop.identification.settings import (
+    ABOUT_LINES,
+    CLEAR_COMB,
+    CLEAR_LINE,
+    CYCLE_BINS,
+    DRIVEN_MAIN,
+    DRIVEN_SHARE,
+    FINE_HARMONICS,
+    HARMONICS,
+    LEAST_CYCLES,
+    LINE_DERIVATIVES,
+    LINE_PIECES,
+    LINE_RESOLVED,
+    LINES_EACH,
+    LOGS_ALIKE,
+    MODEL_ORDERS,
+    MOST_PERIODS,
+    MOSTLY,
+    REPEATED,
+    SAMPLES_PER_PERIOD,
+    STEADY_LINE,
+    UNEVEN_PERIODS,
+)
 from vaneloop.identification.subsystem import Array
 
 __all__ = ["Course", "Lines", "about", "detrended", "periods_along"]
 
-MOST = 2  # periods of one place that are tried
-CLEAR = 40.0  # times the median power about it: a line; the highest of 100,000 of white noise is 17 times it
-CLEAR_COMB = 15.0  # the same of three harmonics, of which noise has 6.5 times the median
-ALONE = (1, CLEAR)  # a wave without multiples
+ALONE = (1, CLEAR_LINE)  # a wave without multiples
 WAVES = ((FINE_HARMONICS, np.inf), (HARMONICS, CLEAR_COMB), ALONE)
-ABOUT = 50  # lines each way that "about" means
-CYCLES, SAMPLES = 6.0, 2.5  # least of the first in a log, of the second in a period
-ORDERS = 6  # multiples of a driven line that are the model's own
-SHARE, MAIN = 0.01, 0.2  # of the variance of what drives the model in a line of it; in one that is most of it
-AGAIN = 0.9  # correlation of what drives the model with itself a while later that means it is repeated
-ALIKE = 0.9  # of the power that logs have in a line: what they have together, where it is the same in each
-PIECES, STEADY = 5, 0.7  # of a log; of a line's power in them: what they have together, 1 of a sine, 0.2 of noise
-MOSTLY = 0.5  # of the sum of squares: what takes off more may be all that is missing, whatever is about it
-TOLD = 0.5  # lines: nearer two frequencies are not told apart
-FINE = 4  # lines of a spectrum for each that its length resolves
 
 
 class Course(NamedTuple):
@@ -126,14 +135,14 @@ def _fitted(parts: Sequence[_Even], harmonics: int, numbers: Array, apart: float
 def _spectrum(part: _Even, f: Array) -> Array:
     """Power of all signals of a course at frequencies ``f`` (Hz), by its length."""
     n, span = len(part.t), float(part.t[-1] - part.t[0])
-    size = int(2 ** np.ceil(np.log2(FINE * n)))
+    size = int(2 ** np.ceil(np.log2(LINES_EACH * n)))
     lines = np.sum(np.abs(np.fft.rfft(part.rows * np.hanning(n), size)) ** 2, axis=0) / n
     return np.interp(f, np.arange(len(lines)) * (n - 1) / span / size, lines)
 
 
 def about(power: Array) -> Array:
     """The median about each line."""
-    middle = scipy.ndimage.median_filter(power, 2 * FINE * ABOUT + 1, mode="reflect")
+    middle = scipy.ndimage.median_filter(power, 2 * LINES_EACH * ABOUT_LINES + 1, mode="reflect")
     return np.asarray(np.maximum(middle, 1e-12 * max(float(power.max()), 1e-300)))
 
 
@@ -151,8 +160,8 @@ class Lines:
         spans = [float(c.t[-1] - c.t[0]) for c in courses]
         self.shortest, self.longest = min(spans), max(spans)
         step = max(span / (len(c.t) - 1) for span, c in zip(spans, courses, strict=True))
-        low, high = CYCLES / self.shortest, 1.0 / (SAMPLES * step)
-        apart = 1.0 / (FINE * self.longest)
+        low, high = LEAST_CYCLES / self.shortest, 1.0 / (SAMPLES_PER_PERIOD * step)
+        apart = 1.0 / (LINES_EACH * self.longest)
         numbers = np.arange(int(np.ceil(low / apart)), int(high / apart)) if 2.0 * low < high else np.zeros(0, int)
         self.apart, self.numbers, self.f = apart, numbers, apart * numbers
         self.driven = [_driven(c, float(self.f[-1])) for c in courses if len(numbers)]
@@ -191,20 +200,20 @@ class Lines:
         for g, parts, harmonics, _ in lines:
             # a line that is driven, too, may be one of time where it has the same phase in every log
             driven = any(d.has(g, harmonics == 1) for d in self.driven)
-            own = not driven or (len(parts) > 1 and _coherence(parts, g) > ALIKE)
+            own = not driven or (len(parts) > 1 and _coherence(parts, g) > LOGS_ALIKE)
             if own and all(abs(g - 1.0 / h) > 2.0 / self.shortest for h, _ in out):
                 out.append((1.0 / g, max(harmonics, HARMONICS)))
-        return out[:MOST]
+        return out[:MOST_PERIODS]
 
     def _peaks(self, power: Array, least: Array) -> list[float]:
         """Frequencies (Hz) of its lines that are above the ``least``, the highest first."""
-        at = scipy.signal.find_peaks(power, least, distance=2 * FINE)[0]
+        at = scipy.signal.find_peaks(power, least, distance=2 * LINES_EACH)[0]
         return [float(self.f[k]) for k in sorted(at, key=lambda k: -power[k])]
 
     def _lines(self, parts: Sequence[_Even]) -> list[float]:
         """Of the error itself."""
         own = np.array([_spectrum(part, self.f) for part in parts])
-        return self._peaks(own.sum(axis=0), CLEAR * np.array([about(o) for o in own]).sum(axis=0))
+        return self._peaks(own.sum(axis=0), CLEAR_LINE * np.array([about(o) for o in own]).sum(axis=0))
 
     def _swings(
         self, errors: Sequence[Array], times: Sequence[Array], waves: Sequence[tuple[int, float]] = WAVES
@@ -220,7 +229,7 @@ class Lines:
         out: list[_Line] = []
         for harmonics, clear in waves:
             below = self.numbers[harmonics * self.numbers <= self.numbers[-1]]
-            if len(below) > 2 * ABOUT:
+            if len(below) > 2 * ABOUT_LINES:
                 falls = _fitted(both, harmonics, below, self.apart)
                 least = np.minimum(clear * about(falls), MOSTLY * whole)
                 many = None if harmonics == 1 else 1  # the next ones are multiples, and parts, of the first
@@ -273,20 +282,22 @@ def _driven(c: Course, highest: float) -> _Driven:
     A line has one phase all along the log. A drive that has more of what is slow, or swings for a while, has none.
     """
     span = float(c.t[-1] - c.t[0])
-    fine = np.arange(1.0 / span, highest, 1.0 / (FINE * span))
-    out = _Driven([], [], TOLD / span, [], 2.0 / span)
+    fine = np.arange(1.0 / span, highest, 1.0 / (LINES_EACH * span))
+    out = _Driven([], [], LINE_RESOLVED / span, [], 2.0 / span)
     for row in c.drivers:
         if not np.ptp(row) > 0.0:
             continue
         part = _even(c.t, row[None])
         power = _spectrum(part, fine)
-        share = np.convolve(power, np.ones(2 * FINE + 1), mode="same") / power.sum()
-        pieces = [_Even(part.t[k], part.rows[:, k]) for k in np.array_split(np.arange(len(part.t)), PIECES)]
-        for k in scipy.signal.find_peaks(power * (share > SHARE), CLEAR * about(power))[0]:
+        share = np.convolve(power, np.ones(2 * LINES_EACH + 1), mode="same") / power.sum()
+        pieces = [_Even(part.t[k], part.rows[:, k]) for k in np.array_split(np.arange(len(part.t)), LINE_PIECES)]
+        for k in scipy.signal.find_peaks(power * (share > DRIVEN_SHARE), CLEAR_LINE * about(power))[0]:
             f = _highest([part], fine[k], span)
-            if _coherence(pieces, f) > STEADY:
-                most = share[k] > MAIN
-                (out.most if most else out.some).extend(order * f for order in range(1, ORDERS + 1 if most else 2))
+            if _coherence(pieces, f) > STEADY_LINE:
+                most = share[k] > DRIVEN_MAIN
+                (out.most if most else out.some).extend(
+                    order * f for order in range(1, MODEL_ORDERS + 1 if most else 2)
+                )
         out.again.extend(_repeats(part.rows[0], span / (len(c.t) - 1)))
     return out
 
@@ -303,14 +314,10 @@ def _repeats(x: Array, step: float) -> list[float]:
     if not len(dip):
         return []
     best = int(dip[0] + np.argmax(alike[dip[0] :]))
-    return [best * step] if alike[best] > AGAIN else []
+    return [best * step] if alike[best] > REPEATED else []
 
 
 # ---- Periods along a channel with which a model's error repeats itself
-
-DERIVATIVES = 2
-EVEN = 0.5  # periods by which a channel must leave a straight course in time
-BINS = 4  # along a channel for each of the finest cycles that are looked for
 
 
 def periods_along(
@@ -325,11 +332,11 @@ def periods_along(
     low = min(float(w.min()) for w in ways)
     span = max(float(w.max()) for w in ways) - low
     steps = np.abs(np.concatenate([np.diff(w) for w in ways]))
-    most = span / max(SAMPLES * float(np.median(steps)), 1e-300)  # cycles from end to end
-    most = min(most, len(steps) / SAMPLES)
-    if not np.isfinite(span) or not most > 2.0 * CYCLES:
+    most = span / max(SAMPLES_PER_PERIOD * float(np.median(steps)), 1e-300)  # cycles from end to end
+    most = min(most, len(steps) / SAMPLES_PER_PERIOD)
+    if not np.isfinite(span) or not most > 2.0 * LEAST_CYCLES:
         return []
-    cells = int(2 ** np.ceil(np.log2(BINS * most)))
+    cells = int(2 ** np.ceil(np.log2(CYCLE_BINS * most)))
     where = [np.minimum(((w - low) * (cells / span)).astype(int), cells - 1) for w in ways]
     found: list[tuple[float, float]] = []
     for rows in _rows(times, errors, signals):
@@ -338,11 +345,11 @@ def periods_along(
     out: list[float] = []
     uneven = max(float(np.ptp(w - np.polyval(np.polyfit(t, w, 1), t))) for w, t in zip(ways, times, strict=True))
     for _, f in sorted(found, reverse=True):
-        if uneven * f < EVEN:
+        if uneven * f < UNEVEN_PERIODS:
             continue  # the channel does what time does
         if all(abs(f - 1.0 / p) > 2.0 / span for p in out):
             out.append(1.0 / f)
-    return out[:MOST]
+    return out[:MOST_PERIODS]
 
 
 def _rows(times: Sequence[Array], errors: Sequence[Array], signals: Sequence[Array]) -> list[list[Array]]:
@@ -354,25 +361,27 @@ def _rows(times: Sequence[Array], errors: Sequence[Array], signals: Sequence[Arr
     out = []
     for j in range(len(errors[0])):
         rows = [e[j] for e in errors]
-        for _ in range(DERIVATIVES + 1):
+        for _ in range(LINE_DERIVATIVES + 1):
             out += [[row * b[i] for row, b in zip(rows, beside, strict=True)] for i in range(len(beside[0]))]
             rows = [np.gradient(row, t) for row, t in zip(rows, times, strict=True)]
     return out
 
 
 def _power(where: Array, row: Array, cells: int) -> Array:
-    """Power of a row along a channel, at each cycle from end to end and `FINE` parts of it, as a share of its own."""
+    """Power of a row along a channel, at each cycle from end to end and `LINES_EACH` parts of it, as a share of its
+    own.
+    """
     row = row - row.mean()
     summed = np.bincount(where, weights=row, minlength=cells)
-    return np.asarray(np.abs(np.fft.rfft(summed, FINE * cells)) ** 2) / max(float(row @ row), 1e-300)
+    return np.asarray(np.abs(np.fft.rfft(summed, LINES_EACH * cells)) ** 2) / max(float(row @ row), 1e-300)
 
 
 def _peaks(power: Array, span: float, most: float) -> list[tuple[float, float]]:
     """How clear lines are, and their frequencies (1 over the channel's unit)."""
-    first, last = int(FINE * CYCLES), min(int(FINE * most), len(power) - 1)
+    first, last = int(LINES_EACH * LEAST_CYCLES), min(int(LINES_EACH * most), len(power) - 1)
     clear = power / about(power)
-    at = scipy.signal.find_peaks(clear[first:last], CLEAR, distance=2 * FINE)[0] + first
-    return [(float(clear[k]), float((k + _between(*power[k - 1 : k + 2])) / (FINE * span))) for k in at]
+    at = scipy.signal.find_peaks(clear[first:last], CLEAR_LINE, distance=2 * LINES_EACH)[0] + first
+    return [(float(clear[k]), float((k + _between(*power[k - 1 : k + 2])) / (LINES_EACH * span))) for k in at]
 
 
 def _between(before: float, at: float, after: float) -> float:

@@ -13,7 +13,8 @@ import numpy as np
 
 from vaneloop.base.curve import SIDE
 from vaneloop.base.hull import hull_of, nearest_within, within
-from vaneloop.identification.candidates.spline_basis import LEVEL, Basis, basis_of
+from vaneloop.identification.candidates.spline_basis import Basis, basis_of
+from vaneloop.identification.settings import LEVEL_SPREAD, SURFACE_SPLINES
 from vaneloop.identification.subsystem import Array, Effect, Parameter
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
 from vaneloop.identification.unmodelled.regressors import Quantity
@@ -23,8 +24,6 @@ from vaneloop.identification.user_models.simulation import Placed
 from vaneloop.identification.user_models.terms import Jump, Surface, Table
 
 __all__ = ["SurfaceCandidate", "may_be_of", "surface_of"]
-
-SPLINES = 5  # of each quantity
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,7 +99,7 @@ class SurfaceCandidate(Candidate):
         wide, out = float(np.sqrt(3.0) * self.size), []
         for i, j in self.pairs:
             bend = float(self.basis.bend[i] + self.across.bend[j])
-            tolerance = wide * (wiggle / np.sqrt(bend) if bend > 0.0 else LEVEL)
+            tolerance = wide * (wiggle / np.sqrt(bend) if bend > 0.0 else LEVEL_SPREAD)
             out.append(Parameter(f"w_{i}_{j}", 0.0, self.unit, scale=self.size, tolerance=tolerance))
         return Effect(self.name, tuple(out), (tuple(0.1 * self.size for _ in out),))
 
@@ -113,7 +112,7 @@ def may_be_of(q: Quantity) -> bool:
     return q.less is None and not follows
 
 
-def surface_of(one: Candidate, two: Candidate, splines: int = SPLINES) -> SurfaceCandidate | None:
+def surface_of(one: Candidate, two: Candidate, splines: int = SURFACE_SPLINES) -> SurfaceCandidate | None:
     """The surface of the quantities of two curves at one place; None where the logs do not spread over both."""
     x, z = one.quantity.visited, two.quantity.visited
     a, b = basis_of(x, splines), basis_of(z, splines)

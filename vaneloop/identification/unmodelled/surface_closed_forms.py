@@ -18,19 +18,22 @@ from vaneloop.base.forms import FORMS, Form, product
 from vaneloop.identification.candidates.closed_forms import Formula, begin, text_of
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import rms_of
-from vaneloop.identification.selection.relative_error_acceptance import FORM, RIVAL, score
-from vaneloop.identification.subsystem import Array
-from vaneloop.identification.unmodelled.closed_form_fits import (
-    CLOSE,
-    DEGREES,
-    MEANT,
-    NEAR,
+from vaneloop.identification.selection.relative_error_acceptance import score
+from vaneloop.identification.settings import (
+    FORM,
+    FORM_MEAN_VALUES,
+    FORM_POOR,
+    FORM_SHAPED,
+    FORMS_ALIKE,
+    FORMS_NEAR,
     PER_NUMBER,
-    POOR,
-    SHAPED,
-    effect_of,
-    goes_on,
-)  # fmt: skip
+    PRODUCT_FORMS,
+    PRODUCT_TURNS,
+    PRODUCTS_REFITTED,
+    RIVAL,
+)
+from vaneloop.identification.subsystem import Array
+from vaneloop.identification.unmodelled.closed_form_fits import DEGREES, effect_of, goes_on
 from vaneloop.identification.unmodelled.fitted_candidate import CandidateSource, FittedCandidate, with_held_out
 from vaneloop.identification.unmodelled.parametric_substitution import more_left, takes_mean_back
 from vaneloop.identification.unmodelled.problem import CurveProblem
@@ -39,8 +42,6 @@ from vaneloop.identification.user_models.simulation import Placed
 
 __all__ = ["Product", "as_the_law", "fitted_products", "likely_products"]
 
-TURNS = 60  # by which f and g are found
-EACH, REFITTED = 4, 8  # formulas of each quantity, and pairs of them that are fitted in the simulation
 Begun = tuple[Form, Array]  # a formula, and numbers to begin with
 Ends = tuple[tuple[float, float], tuple[float, float]]  # ranges of both quantities
 
@@ -68,7 +69,9 @@ def fitted_products(ground: CandidateSource, tried: FittedCandidate) -> list[tup
         if (apart := _factors(tried, c, samples, lent)) is not None:
             pairs.append(_likely(c, samples, apart))
     some = [pair for rank in zip_longest(*pairs) for pair in rank if pair is not None]
-    fitted = [f for one, other in some[:REFITTED] if (f := _in_simulation(ground, tried, c, one, other)) is not None]
+    fitted = [
+        f for one, other in some[:PRODUCTS_REFITTED] if (f := _in_simulation(ground, tried, c, one, other)) is not None
+    ]
     return sorted(fitted, key=lambda f: np.log(f[0].error) + PER_NUMBER * len(f[0].numbers))
 
 
@@ -78,9 +81,9 @@ def likely_products(tried: FittedCandidate, before: float) -> list[Formula]:
     before  held-out error without the surface, in noise floors: no law's form is known better than `FORM` of it
     """
     own = rms_of(tried.judge, tried.fit)
-    poor = float(np.hypot(POOR * max(own, 1.0), FORM * before))
+    poor = float(np.hypot(FORM_POOR * max(own, 1.0), FORM * before))
     near = [f for f, _ in tried.formulas or () if f.error <= poor]
-    limit = max(min((f.error for f in near), default=0.0), min(own, 1.0)) * (1.0 + NEAR)
+    limit = max(min((f.error for f in near), default=0.0), min(own, 1.0)) * (1.0 + FORMS_NEAR)
     out: dict[str, Formula] = {}
     for f in sorted((f for f in near if f.error <= limit), key=lambda f: (f.complexity, f.error)):
         out.setdefault(f.text, f)
@@ -99,9 +102,9 @@ def _likely(
             if form.name == "constant" or (form.name == "Arrhenius" and q.unit not in DEGREES):
                 continue
             got = begin(form, some, factor(some), ())
-            if got is not None and got[1] < SHAPED:
-                mine.append((float(np.log(max(got[1], CLOSE)) + 0.3 * form.complexity), (form, got[0])))
-        near.append(sorted(mine, key=lambda m: m[0])[:EACH])
+            if got is not None and got[1] < FORM_SHAPED:
+                mine.append((float(np.log(max(got[1], FORMS_ALIKE)) + 0.3 * form.complexity), (form, got[0])))
+        near.append(sorted(mine, key=lambda m: m[0])[:PRODUCT_FORMS])
     ranked = sorted(((a[0] + b[0], a[1], b[1]) for a in near[0] for b in near[1]), key=lambda p: p[0])
     return [(one, other) for _, one, other in ranked]
 
@@ -110,7 +113,7 @@ def _samples(c: SurfaceCandidate) -> tuple[Array, Array]:
     """Places where the logs have been."""
     x, z = c.quantity.visited, c.other.visited
     good = np.flatnonzero(np.isfinite(x) & np.isfinite(z))
-    some = good[np.linspace(0, len(good) - 1, min(len(good), MEANT)).astype(int)]
+    some = good[np.linspace(0, len(good) - 1, min(len(good), FORM_MEAN_VALUES)).astype(int)]
     return x[some], z[some]
 
 
@@ -149,14 +152,14 @@ def _factors(
         normal = design.T @ design
         return np.linalg.solve(normal + 1e-9 * np.diag(np.diag(normal) + 1e-300), design.T @ y)
 
-    for _ in range(TURNS):
+    for _ in range(PRODUCT_TURNS):
         f = nearest(phi * g[:, None])[: phi.shape[1]]
         back = nearest(psi * (phi @ f)[:, None])
         other = back[: psi.shape[1]]
         left = y - (phi @ f) * (psi @ other) - one @ back[psi.shape[1] :]
         other = other / max(float(np.sqrt(np.mean((psi @ other) ** 2))), 1e-300)
         g = psi @ other
-    if not np.var(left) < SHAPED * np.var(y):
+    if not np.var(left) < FORM_SHAPED * np.var(y):
         return None
     return _Factor(c, 0, f), _Factor(c, 1, other)
 

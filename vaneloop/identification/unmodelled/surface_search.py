@@ -12,21 +12,27 @@ from itertools import combinations, zip_longest
 import numpy as np
 
 from vaneloop.identification.results import rms_of
-from vaneloop.identification.selection.relative_error_acceptance import RIVAL, UNKNOWN, score
+from vaneloop.identification.selection.relative_error_acceptance import score
+from vaneloop.identification.settings import (
+    FINE_SURFACE_SPLINES,
+    MAY_CATCH_UP,
+    RIVAL,
+    SCREENED_BEND,
+    SURFACE_BENDS_TRIED,
+    SURFACE_QUANTITIES,
+    SURFACES_FINISHED,
+    SURFACES_QUICK,
+    SURFACES_TRIED,
+    UNKNOWN,
+)
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate, Outcome, plain, strange
 from vaneloop.identification.unmodelled.problem import CurveProblem
-from vaneloop.identification.unmodelled.screening import SCREENED, smoothed
-from vaneloop.identification.unmodelled.surface_candidates import SPLINES, SurfaceCandidate, may_be_of, surface_of
+from vaneloop.identification.unmodelled.screening import smoothed
+from vaneloop.identification.unmodelled.surface_candidates import SurfaceCandidate, may_be_of, surface_of
 from vaneloop.identification.unmodelled.surface_closed_forms import fitted_products
 
 __all__ = ["put_surface"]
-
-QUANTITIES = 5  # of which pairs are made
-TRIED, QUICK, FINISHED = 48, 10, 4  # surfaces that are fitted for one step, for a few, to the end
-FINE = SPLINES + 1  # splines each way where the best still fails
-WIGGLES = (0.03, 0.1, 0.3, SCREENED, 5.0)  # as of curves, in smaller steps
-NEAR = 0.25  # log error within which another surface may still do as well with more splines
 
 
 def put_surface(learner: CurveProblem, out: Outcome) -> None:
@@ -76,7 +82,7 @@ def _candidates(learner: CurveProblem) -> list[SurfaceCandidate]:
     known = [c for c in learner.candidates if may_be_of(c.quantity)]
     ranked = [t.candidate for column in zip_longest(*learner.ranked) for t in column if t is not None]
     first = [c.quantity.name for c in ranked if may_be_of(c.quantity)]
-    names = list(dict.fromkeys([*first, *(c.quantity.name for c in known)]))[:QUANTITIES]
+    names = list(dict.fromkeys([*first, *(c.quantity.name for c in known)]))[:SURFACE_QUANTITIES]
     places = list(dict.fromkeys((c.how, c.at) for c in (*ranked, *known)))
     both = []
     for k, place in enumerate(places):
@@ -84,21 +90,21 @@ def _candidates(learner: CurveProblem) -> list[SurfaceCandidate]:
         order = {c.quantity.name: names.index(c.quantity.name) if c.quantity.name in names else 0 for c in here}
         both += [(k + order[a.quantity.name] + order[b.quantity.name], a, b) for a, b in combinations(here, 2)]
     both.sort(key=lambda pair: pair[0])
-    return [s for _, one, two in both[:TRIED] if (s := surface_of(one, two)) is not None]
+    return [s for _, one, two in both[:SURFACES_TRIED] if (s := surface_of(one, two)) is not None]
 
 
 def _finished(learner: CurveProblem, nothing: FittedCandidate) -> list[FittedCandidate]:
     """The surfaces that promise most, fitted to the end in place of all curves; best first."""
-    one_step = lambda c: learner.fitted(nothing, c, SCREENED, _begin(learner, nothing, c), 1, True)  # noqa: E731
+    one_step = lambda c: learner.fitted(nothing, c, SCREENED_BEND, _begin(learner, nothing, c), 1, True)  # noqa: E731
     begun = list(learner.each(one_step, _candidates(learner)))
     begun.sort(key=lambda t: float(t.fit.cost.sum()))
-    few = lambda t: learner.fitted(nothing, t.candidate, SCREENED, t.fit, 5, True)  # noqa: E731
-    quick = list(learner.each(few, begun[:QUICK]))
+    few = lambda t: learner.fitted(nothing, t.candidate, SCREENED_BEND, t.fit, 5, True)  # noqa: E731
+    quick = list(learner.each(few, begun[:SURFACES_QUICK]))
     quick.sort(key=lambda t: score(t.judge, t.fit))
-    to_the_end = lambda t: smoothed(learner, nothing, t.candidate, t.fit, WIGGLES)  # noqa: E731
-    done = learner.ordered(list(learner.each(to_the_end, quick[:FINISHED])))
+    to_the_end = lambda t: smoothed(learner, nothing, t.candidate, t.fit, SURFACE_BENDS_TRIED)  # noqa: E731
+    done = learner.ordered(list(learner.each(to_the_end, quick[:SURFACES_FINISHED])))
     if done and learner.fails(done[0]):
-        close = [t for t in done if learner.score(t, done) < learner.score(done[0], done) + NEAR]
+        close = [t for t in done if learner.score(t, done) < learner.score(done[0], done) + MAY_CATCH_UP]
         done = learner.ordered(
             [*done, *(f for f in learner.each(lambda t: _finer(learner, nothing, t), close) if f is not None)]
         )
@@ -129,17 +135,17 @@ def _begin(learner: CurveProblem, nothing: FittedCandidate, c: SurfaceCandidate)
 
 
 def _finer(learner: CurveProblem, nothing: FittedCandidate, coarse: FittedCandidate) -> FittedCandidate | None:
-    """The same surface with `FINE` splines of each quantity."""
+    """The same surface with `FINE_SURFACE_SPLINES` splines of each quantity."""
     c = coarse.candidate
     assert isinstance(c, SurfaceCandidate)
-    fine = surface_of(c, replace(c, quantity=c.other), FINE)
+    fine = surface_of(c, replace(c, quantity=c.other), FINE_SURFACE_SPLINES)
     if fine is None:
         return None
     table, amplitudes = coarse.table()
     (one, other), n = fine.grids, len(coarse.fit.theta) - len(amplitudes)
     design = np.kron(fine.basis.design(one), fine.across.design(other)) @ fine.turn
     theta = np.concatenate([coarse.fit.theta[:n], np.linalg.lstsq(design, table(amplitudes).ravel(), rcond=None)[0]])
-    return smoothed(learner, nothing, fine, theta, WIGGLES, coarse.wiggle)
+    return smoothed(learner, nothing, fine, theta, SURFACE_BENDS_TRIED, coarse.wiggle)
 
 
 def _sum(learner: CurveProblem, nothing: FittedCandidate, whole: FittedCandidate) -> FittedCandidate:

@@ -10,6 +10,29 @@ import scipy
 
 from plant.model import Learned
 from vaneloop.identification.candidates import laws
+from vaneloop.identification.settings import (
+    FACTOR,
+    FITS_FROM,
+    GIVEN,
+    LEAST_QUANTUM,
+    LEAST_WINDOW,
+    MOST_DRAWN,
+    MOST_SAMPLES,
+    MOST_SHRUNK,
+    QUANTUM_FINER,
+    QUANTUM_FREQUENCIES,
+    QUANTUM_MOST_FINER,
+    QUANTUM_PEAKS,
+    QUANTUM_SAMPLES,
+    SLIGHT,
+    START_DRAWS,
+    START_FORGOTTEN,
+    START_STEP,
+    START_STEPS,
+    START_WINDOWS,
+    START_WITHIN,
+    WIDE,
+)
 from vaneloop.identification.subsystem import Array, Effect, Parameter, Stage, StageError, size_of
 from vaneloop.identification.user_models.data import Data, noise_of_channel
 from vaneloop.identification.user_models.injection_points import Course, nominal_course, places
@@ -18,21 +41,6 @@ from vaneloop.identification.user_models.simulation import Placed, Runner
 from vaneloop.identification.user_models.system import Record, System
 
 __all__ = ["BoundSystem", "rms_of_rows", "steps_seen"]
-
-# Half-width of the interval that later fits may use: in sizes of a parameter that the user calls unknown, and in values
-# that the user gave, which may be wrong by a factor of ten.
-WIDE, GIVEN = 4.0, 12.0
-SLIGHT, MOST_SHRUNK = 0.3, 8  # what a small step may move of an output's spread; tries at ever smaller ones
-DRAWS = 3  # of the noise that the model starts from
-FORGOTTEN = 0.2  # of an output's noise: what noise in a reading that a state starts at may do to it, and not be fitted
-TRIED = 0.1  # of the noise: by so much a start is moved to see what it does
-WITHIN = 3.0  # times its sensor's noise: so far a start may be from its reading
-FACTOR = 10.0  # by which a value that the user gave may be wrong
-MOST_DRAWN = 7  # powers of two: sets of values drawn in all, by the number of unknown parameters
-WINDOWS, LEAST_WINDOW = 60, 10  # of a log that values are first fitted to; samples in one at least
-FROM = 4  # of these that a fit begins from, beside the user's own
-MOST_STEPS = 16
-MOST_SAMPLES = 12_000  # that the search looks at; simulations and laws run on all
 
 
 def rms_of_rows(error: Array) -> Array:
@@ -231,7 +239,7 @@ class BoundSystem:
         rng = np.random.default_rng(0)
         noisy = {*self.system.outputs, self.system.position, self.system.velocity} - {*self.system.inputs}
         out = []
-        for _ in range(DRAWS):
+        for _ in range(START_DRAWS):
             again = []
             for r in self.data.records:
                 noise = {name: noise_of_channel(v) * rng.standard_normal(len(v)) for name, v in r.columns.items()}
@@ -319,21 +327,23 @@ class BoundSystem:
         ]  # fmt: skip
 
     def _starts_matter(self, values: Array) -> bool:
-        """Whether noise in the readings that states start at does more to an output than `FORGOTTEN` of its noise."""
+        """Whether noise in the readings that states start at does more to an output than `START_FORGOTTEN` of its
+        noise.
+        """
         noise, runner = self.data.noise(), self.runner
         names, n_p = list(self.system.outputs), len(self.system.parameters)
         known, read = len(runner.free_starts), self._read()
         sets = [np.concatenate([values, [self.data.first_state(log, name, 0.0) for log, _, name in read]])]
         for state in dict.fromkeys(name for _, _, name in read):
-            step = [TRIED * noise[names.index(name)] * (name == state) for _, _, name in read]
+            step = [START_STEP * noise[names.index(name)] * (name == state) for _, _, name in read]
             sets.append(sets[0] + np.concatenate([np.zeros(n_p + known), step]))
         if len(sets) == 1:
             return False
         runner.free_starts += [(log, m) for log, m, _ in read]
         out = self.run(np.array(sets))
         del runner.free_starts[known:]
-        moved = np.sqrt(np.mean(np.sum((out[1:] - out[0]) ** 2, axis=0), axis=1)) / TRIED
-        return bool(np.any(moved > FORGOTTEN * noise))
+        moved = np.sqrt(np.mean(np.sum((out[1:] - out[0]) ** 2, axis=0), axis=1)) / START_STEP
+        return bool(np.any(moved > START_FORGOTTEN * noise))
 
     def _read_starts(self) -> list[Parameter]:
         """States that start a log at their sensors' readings, as parameters known to within the sensors' noise."""
@@ -343,7 +353,10 @@ class BoundSystem:
         for log, m, name in self._read():
             self.runner.free_starts.append((log, m))
             suffix = f"_{log + 1}" if len(self.data.records) > 1 else ""
-            value, wide = self.data.first_state(log, name, 0.0), WITHIN * noise[list(self.system.outputs).index(name)]
+            value, wide = (
+                self.data.first_state(log, name, 0.0),
+                START_WITHIN * noise[list(self.system.outputs).index(name)],
+            )
             unit = self.system.states[name]
             out.append(Parameter(f"start_{name}{suffix}", value, unit, tolerance=float(wide), log=log + 1))
         return out
@@ -415,7 +428,9 @@ class BoundSystem:
         measured = all(n in s.outputs or (n in s.rates and s.rates[n] in s.outputs) for n in s.states)
         if s.window or s.kind != "simulate" or not s.rates or not measured:
             return []
-        data.window = max(data.records[0].t[-1] / WINDOWS, LEAST_WINDOW * float(np.median(np.diff(data.records[0].t))))
+        data.window = max(
+            data.records[0].t[-1] / START_WINDOWS, LEAST_WINDOW * float(np.median(np.diff(data.records[0].t)))
+        )
         first = min(begins, key=lambda z: float(np.sum(error(z) ** 2)))
         best = scipy.optimize.least_squares(error, first, bounds=(low, high), diff_step=1e-4, max_nfev=20).x
         data.window = None
@@ -452,7 +467,7 @@ class BoundSystem:
             both = np.sum(weight * (m - mm[:, :, None]) * (y - my[:, None]), axis=2)
             total = np.sum(weight * (y - my[:, None]) ** 2, axis=1)
             bent[i : i + 32] = np.where(inside, np.sum(total - both**2 / np.maximum(var, 1e-12), axis=1), np.inf)
-        best = [*np.argsort(plain)[: FROM // 2], *np.argsort(bent)[: FROM // 2]]
+        best = [*np.argsort(plain)[: FITS_FROM // 2], *np.argsort(bent)[: FITS_FROM // 2]]
         return [z[i] for i in dict.fromkeys(int(i) for i in best) if np.isfinite(plain[i])]
 
     def _scan_starts(self, theta: Array, columns: list[int]) -> None:
@@ -489,7 +504,7 @@ class BoundSystem:
         scale = np.nanstd(self.measured, axis=1)
         scale = np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
         before = self.run(values[None])[0]
-        while self.runner.steps < MOST_STEPS:
+        while self.runner.steps < START_STEPS:
             self.runner.steps *= 2
             after = self.run(values[None])[0]
             change = float(np.max(np.sqrt(np.mean((after - before) ** 2, axis=1)) / scale))
@@ -533,12 +548,6 @@ class BoundSystem:
 
 # ---- Which steps a sensor may round to, as its values and the nominal model's errors tell: a fit sees no slope there
 
-LEAST = 1.0  # times the noise: a smaller step makes an error of less than 0.3 of it
-MOST_FREQUENCIES = 6000
-SAMPLES = 3000  # looked at
-KEPT = 3  # of each kind of peak
-FINER, MOST_FINER = 16.0, 500  # frequencies tried around a peak, to one turn of the phase; at most
-
 
 def steps_seen(measured: Array, model: Array, noise: float) -> list[float]:
     """Steps to begin from, ascending; empty where there is nothing to look at.
@@ -551,22 +560,22 @@ def steps_seen(measured: Array, model: Array, noise: float) -> list[float]:
     if len(y) < 2:
         return []
     span = float(np.ptp(m))
-    least = max(LEAST * noise, 4.0 * span / MOST_FREQUENCIES)
+    least = max(LEAST_QUANTUM * noise, 4.0 * span / QUANTUM_FREQUENCIES)
     if not span > 2.0 * least:
         return []
     f = np.arange(2.0 / span, 1.0 / least, 0.25 / span)
-    stride = max(1, len(y) // SAMPLES)
+    stride = max(1, len(y) // QUANTUM_SAMPLES)
     y, m = y[::stride], m[::stride]
     error = y - m - np.mean(y - m)
     with_error = _sums(f, m - m[0], error)
     of_values = _sums(f, y - y[0], np.full(len(y), 1.0 / len(y)))
     out: set[float] = set()
-    finer = 1.0 / (FINER * max(float(np.max(np.abs(m))), span))
+    finer = 1.0 / (QUANTUM_FINER * max(float(np.max(np.abs(m))), span))
     for height in (with_error, of_values):
         inner = height[1:-1]
         peaks = 1 + np.flatnonzero((inner >= height[:-2]) & (inner > height[2:]))
-        for k in peaks[np.argsort(-height[peaks], kind="stable")][:KEPT]:
-            many = min(int(0.25 / span / finer) + 1, MOST_FINER // 2)
+        for k in peaks[np.argsort(-height[peaks], kind="stable")][:QUANTUM_PEAKS]:
+            many = min(int(0.25 / span / finer) + 1, QUANTUM_MOST_FINER // 2)
             sizes = 1.0 / (f[k] + finer * np.arange(-many, many + 1))
             left = [float(np.sum((y - np.round(m / s) * s) ** 2)) for s in sizes]
             best = f[k] + finer * (int(np.argmin(left)) - many)

@@ -21,14 +21,12 @@ from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProbl
 from vaneloop.identification.results import StageDiagnosis, answer_of, at_bound, rms_of
 from vaneloop.identification.selection.diagnosis import Judged
 from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance
+from vaneloop.identification.settings import BOUND_PULL, DRIVES, NO_HELP, STARTS_LOADED
 from vaneloop.identification.subsystem import Array, StageError
 from vaneloop.identification.user_models.bound_system import BoundSystem, rms_of_rows
-from vaneloop.identification.user_models.simulation import STARTS_LOADED
 from vaneloop.identification.user_models.system import Record, System
 
-__all__ = ["NO_HELP", "ByLog", "Logs", "as_given", "bind", "load_model_of", "parameter_warnings"]
-
-NO_HELP = 0.85  # error with a law over error without it, from which it hardly helps
+__all__ = ["ByLog", "Logs", "as_given", "bind", "load_model_of", "parameter_warnings"]
 
 
 @dataclass
@@ -292,8 +290,6 @@ def load_model_of(path: str | Path, system: System) -> Model:
 
 # ---- What should make a reader doubt an answer on a model of his own: parameters at their bounds, signs the wrong way
 
-PULL = 0.01  # share of the squared error that a parameter at its bound would take off beyond it: the logs ask for it
-AGAINST = -0.05  # power of the measured force, in RMS force times RMS velocity: what is driven takes some
 # laws that may have either sign, and what the unusual one means
 BACKWARDS = {
     laws.QUADRATIC_DRAG: "drives the motion instead of braking it",
@@ -345,7 +341,7 @@ def _pulled(fit: Fit, judge: LeastSquaresProblem, column: int, side: float) -> b
         return False
     k = int(where[0])
     g, a = float(fit.gradients[:, k].sum()), float(fit.normals[:, k, k].sum())
-    return g * side > 0.0 and a > 0.0 and g * g / a > PULL * float(fit.cost.sum())
+    return g * side > 0.0 and a > 0.0 and g * g / a > BOUND_PULL * float(fit.cost.sum())
 
 
 def _against(bound: BoundSystem) -> list[str]:
@@ -357,7 +353,7 @@ def _against(bound: BoundSystem) -> list[str]:
         force, v = bound.measured[0, at], u[1]
         use = np.isfinite(force)
         size = float(np.sqrt(np.mean(force[use] ** 2) * np.mean(v[use] ** 2))) if use.any() else 0.0
-        if size > 0.0 and float(np.mean(force[use] * v[use])) < AGAINST * size:
+        if size > 0.0 and float(np.mean(force[use] * v[use])) < DRIVES * size:
             name = next(iter(bound.system.outputs))
             out.append(
                 f"{log}: {name} acts against the motion, so that the machine gives power; friction is looked for where "

@@ -10,6 +10,17 @@ import numpy as np
 import scipy
 
 from vaneloop.base.sizes import LARGEST, beyond, no_smaller
+from vaneloop.identification.settings import (
+    EDGE_PERIODS,
+    INPUT_JUMP,
+    LONGEST_SPIKE,
+    MOVES,
+    SPIKE_ANSWERS,
+    SPIKE_BACK,
+    SPIKE_FAR,
+    SPIKE_SHARE,
+    SPLINE_MEMORY,
+)
 from vaneloop.identification.subsystem import Array, StageError
 from vaneloop.identification.user_models.exogenous_regressors import column_of
 from vaneloop.identification.user_models.motion import (
@@ -24,10 +35,6 @@ from vaneloop.identification.user_models.motion import (
 from vaneloop.identification.user_models.system import Record, System
 
 __all__ = ["Data", "noise_of_channel", "spikes"]
-
-MOVES = 0.3  # times its RMS: a velocity above that at the start is told
-EDGE = 2.0  # periods of the cut-off that do not count at the ends of a differentiated log
-SPLINE = 8  # samples from an end over which a derivative by splines forgets it: to 0.27^8 of the error there
 
 
 class Data:
@@ -130,7 +137,7 @@ class Data:
                 u = [x, v, a, *u]
                 if self.cutoff and self.motion_cutoff:  # as the model's: its motion, then the force that follows
                     y = np.array([low_pass(r.t, low_pass(r.t, row, self.motion_cutoff), self.cutoff) for row in y])
-                    edge = EDGE / self.cutoff + SPLINE * float(np.median(np.diff(r.t)))
+                    edge = EDGE_PERIODS / self.cutoff + SPLINE_MEMORY * float(np.median(np.diff(r.t)))
                     y[:, (r.t < edge) | (r.t > r.t[-1] - edge)] = np.nan
             self.u.append(np.ascontiguousarray(np.array(u, dtype=float).reshape(len(u), len(r.t))))
             self.y.append(y)
@@ -313,13 +320,6 @@ def _of_white(n: int) -> tuple[float, float]:
 
 # ---- Samples of a reading that jump away from their neighbours and back: a sensor or a logger that failed for a moment
 
-LONGEST = 3  # samples: what stays away for longer is no spike
-FAR = 10.0  # times what all but 3 % of the samples stay within, of the straight line between their neighbours
-BACK = 0.1  # of the jump: so near to where they were before it the samples come back, and move so little beside it
-JUMP = 5.0  # times what is usual from sample to sample: a jump of an input
-ANSWERS = 0.25  # share of an input's jumps with a spike beside them
-FEW = 0.005  # share of the samples: what is away more often is how the machine is
-
 
 def spikes(y: Array, drives: Sequence[Array] = ()) -> Array:
     """Which samples of a reading are spikes, bool[samples]; NaN is none.
@@ -334,22 +334,22 @@ def spikes(y: Array, drives: Sequence[Array] = ()) -> Array:
     steps = np.abs(np.diff(v))
     usual = max(float(np.quantile(off, 0.97)), float(steps[steps > 0.0].min(initial=np.inf)))
     found = np.zeros(len(v), dtype=bool)
-    for run in range(LONGEST, 0, -1):
+    for run in range(LONGEST_SPIKE, 0, -1):
         n = len(v) - run - 3
         first, before, after, last = (v[k : k + n] for k in (0, 1, run + 2, run + 3))
         between = np.stack([v[k : k + n] for k in range(2, run + 2)]) - 0.5 * (before + after)
         least = np.abs(between).min(axis=0)
-        away = (least > FAR * usual) & (np.all(between > 0.0, axis=0) | np.all(between < 0.0, axis=0))
+        away = (least > SPIKE_FAR * usual) & (np.all(between > 0.0, axis=0) | np.all(between < 0.0, axis=0))
         for one, other in ((before, after), (first, before), (after, last)):  # what swings does not stand still there
-            away &= np.abs(one - other) < BACK * least
+            away &= np.abs(one - other) < SPIKE_BACK * least
         for k in np.flatnonzero(away):
             found[k + 2 : k + 2 + run] = True
-    about = np.convolve(found, np.ones(2 * LONGEST + 1), "same") > 0.5
+    about = np.convolve(found, np.ones(2 * LONGEST_SPIKE + 1), "same") > 0.5
     for u in drives:
         moved = np.abs(np.diff(u[at], prepend=u[at][0]))
-        jumps = moved > JUMP * np.median(moved)
-        if about[jumps].sum() > ANSWERS * jumps.sum():  # so the machine answers to this input
-            found &= np.convolve(jumps, np.ones(2 * LONGEST + 1), "same") < 0.5
-    if found.mean() <= FEW:
+        jumps = moved > INPUT_JUMP * np.median(moved)
+        if about[jumps].sum() > SPIKE_ANSWERS * jumps.sum():  # so the machine answers to this input
+            found &= np.convolve(jumps, np.ones(2 * LONGEST_SPIKE + 1), "same") < 0.5
+    if found.mean() <= SPIKE_SHARE:
         out[at[found]] = True
     return out

@@ -12,14 +12,10 @@ import numpy as np
 from vaneloop.base.compiled import compiled
 from vaneloop.base.durations import in_name, named_lag
 from vaneloop.base.hysteresis import STOPS, slipped, weights_of
+from vaneloop.identification.settings import BEFORE_LOG, COARSE_STOPS, NEGATIVE_STOPS, NO_TURN
 from vaneloop.identification.subsystem import Array
 
 __all__ = ["STOPS", "dissipates", "forgotten", "is_memory", "lagged", "lagged_name", "named_lag", "of_stops", "swings"]
-
-COARSE = 5  # stops by which a curve is judged: its second derivative is mostly noise
-BEFORE = 0.05  # share of a hysteresis's height that may be of what was before the log
-NO_TURN = 0.02  # share of its whole way by which a channel may go back without having turned
-NEGATIVE = 0.2  # share of the stops' weights that may be negative, as noise makes them
 
 
 def is_memory(name: str) -> bool:
@@ -52,9 +48,9 @@ def of_stops(q: Array, low: float, high: float, table: Array) -> Array:
 
 def dissipates(low: float, high: float, table: Array) -> bool:
     """Whether the stops of a virgin curve, seen coarsely, have weights of one sign: then they only take energy."""
-    weights = weights_of(low, high, table, COARSE)[:-1]  # the last one stands for all that is wider
+    weights = weights_of(low, high, table, COARSE_STOPS)[:-1]  # the last one stands for all that is wider
     size = float(np.abs(weights).sum())
-    return size > 0.0 and min(np.maximum(weights, 0.0).sum(), np.maximum(-weights, 0.0).sum()) <= NEGATIVE * size
+    return size > 0.0 and min(np.maximum(weights, 0.0).sum(), np.maximum(-weights, 0.0).sum()) <= NEGATIVE_STOPS * size
 
 
 def forgotten(q: Array, high: float, table: Array) -> Array:
@@ -67,7 +63,7 @@ def forgotten(q: Array, high: float, table: Array) -> Array:
     way = np.maximum.accumulate(q) - np.minimum.accumulate(q)
     highest, lowest = (f.accumulate(table[::-1])[::-1] for f in (np.maximum, np.minimum))
     rest = np.interp(0.5 * way, np.linspace(0.0, high, len(table)), np.maximum(highest - table, table - lowest))
-    return np.asarray(np.maximum.accumulate(rest <= BEFORE * np.max(np.abs(table))))
+    return np.asarray(np.maximum.accumulate(rest <= BEFORE_LOG * np.max(np.abs(table))))
 
 
 def swings(q: Array) -> Array:

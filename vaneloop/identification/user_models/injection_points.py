@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from vaneloop.identification.candidates.library import LAWS, SIGNAL_LAWS, STATE_LAWS, Law, Size
+from vaneloop.identification.settings import RUN_AWAY
 from vaneloop.identification.subsystem import Array, Effect, size_of
 from vaneloop.identification.user_models.codegen import Dispatch, try_law
 from vaneloop.identification.user_models.data import Data
@@ -19,7 +20,6 @@ from vaneloop.identification.user_models.system import Record
 __all__ = ["Course", "nominal_course", "places"]
 
 SENSOR_OF_FORCE = ("gain", "saturation", "lag", "second_order_lag", "dead_time")  # what follows a sum of forces
-RUN_AWAY = 1e50  # beyond it a simulated value is no size of anything; the numbers of laws made from it stay finite
 
 
 def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed], list[Effect]]:

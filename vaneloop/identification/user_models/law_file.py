@@ -9,7 +9,7 @@ from vaneloop.base.durations import folded
 from vaneloop.base.errors import InputError
 from vaneloop.base.forms import FORMS
 from vaneloop.identification.candidates.library import Law
-from vaneloop.identification.candidates.spline_basis import LEVEL
+from vaneloop.identification.settings import CURVE_BOUND, LEVEL_SPREAD
 from vaneloop.identification.subsystem import Effect, Parameter, StageError
 from vaneloop.identification.user_models.data import Data
 from vaneloop.identification.user_models.exogenous_regressors import DISTANCE, SINCE, TIME, WAY, sides_of
@@ -20,7 +20,6 @@ from vaneloop.identification.user_models.terms import COLUMN, HOW, INPUT, OUTPUT
 __all__ = ["CURVE_LAW", "from_file"]
 
 CURVE_LAW = Law("curve", 0, "a function of one quantity", lambda _: ((), ()))
-FAR = 1e3  # usual sizes: bound of a curve's values
 
 
 def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
@@ -81,9 +80,9 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
         )  # fmt: skip
     names = law.numbers
     sizes = [max(abs(v), 1e-9) for v in law.values] if law.form else [abs(law.size) or 1.0] * len(names)
-    wide = np.sqrt(3.0) * LEVEL if not law.form else 0.0  # a curve's values are known to be of its size
+    wide = np.sqrt(3.0) * LEVEL_SPREAD if not law.form else 0.0  # a curve's values are known to be of its size
     ps = tuple(
-        Parameter(n, 0.0, law.unit, -FAR * z, FAR * z, scale=z, tolerance=float(wide * z))
+        Parameter(n, 0.0, law.unit, -CURVE_BOUND * z, CURVE_BOUND * z, scale=z, tolerance=float(wide * z))
         for n, z in zip(names, sizes, strict=True)
     )
     effect = Effect(name, ps, (tuple(float(v) for v in law.values),), "a function that was learned")

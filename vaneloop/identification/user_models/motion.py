@@ -9,17 +9,13 @@ from typing import Any
 import numpy as np
 import scipy
 
+from vaneloop.identification.settings import ABOVE_WHITE, FLAT_TO, FORCE_SHARE, SPECTRUM_PARTS
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.user_models.system import Record, System
 
 __all__ = ["MOTION", "differentiated_to", "highest_frequency", "low_pass", "motion", "smoothed", "uses"]
 
 MOTION = ("position", "velocity", "acceleration")
-FORCE_SHARE = 0.9995  # of the power of the measured force lies below the frequency up to which forces are compared
-FLAT = 3.0  # times that frequency motion is differentiated, so that what is compared passes the low-pass whole
-
-PARTS = 20  # of a spectrum: the quieter quarter of them is its white noise
-SPREADS = 2.0  # by so many the power above a frequency may exceed that of white noise
 
 
 def highest_frequency(outputs: Iterable[str], records: Sequence[Record]) -> float:
@@ -35,7 +31,7 @@ def highest_frequency(outputs: Iterable[str], records: Sequence[Record]) -> floa
             total = float(power.sum()) - noise * len(f)
             if not total > 0.0:
                 continue
-            force = above - noise * left - SPREADS * noise * np.sqrt(left)
+            force = above - noise * left - ABOVE_WHITE * noise * np.sqrt(left)
             best = max(best, float(f[int(np.argmax(force <= (1.0 - FORCE_SHARE) * total))]))
     rate = 1.0 / float(np.median(np.diff(records[0].t)))
     return float(np.clip(best, 5.0 / records[0].t[-1], 0.2 * rate))
@@ -48,7 +44,7 @@ def differentiated_to(s: System, records: Sequence[Record], cutoff: float) -> fl
     """
     channel, order = (str(s.velocity), 0) if s.velocity else (str(s.position), 1)
     order += uses(s.model, "acceleration")
-    best = FLAT * cutoff
+    best = FLAT_TO * cutoff
     for r in records:
         f, power, noise = _spectrum(r, channel)
         gain = f ** (2 * order)
@@ -63,7 +59,7 @@ def _spectrum(r: Record, channel: str) -> tuple[Array, Array, float]:
     y = r.columns[channel]
     y = np.where(np.isfinite(y), y, np.nanmean(y))
     f, power = scipy.signal.welch(y - y.mean(), 1.0 / float(np.median(np.diff(r.t))), nperseg=min(4096, len(y)))
-    return f, power, float(np.quantile([part.mean() for part in np.array_split(power, PARTS)], 0.25))
+    return f, power, float(np.quantile([part.mean() for part in np.array_split(power, SPECTRUM_PARTS)], 0.25))
 
 
 def motion(s: System, r: Record, cutoff: float | None) -> tuple[Array, Array, Array]:

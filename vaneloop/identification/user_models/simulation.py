@@ -17,6 +17,7 @@ from vaneloop.base.side_by_side import shared_out
 from vaneloop.base.spline_rates import SplineRates
 from vaneloop.identification.candidates import laws
 from vaneloop.identification.candidates.library import Law
+from vaneloop.identification.settings import SHORT_RUN, SPLINE_SAMPLES, STARTS_LOADED, SWITCHED
 from vaneloop.identification.subsystem import Array, StageError
 from vaneloop.identification.user_models.codegen import Dispatch, dispatch_of
 from vaneloop.identification.user_models.data import Data
@@ -36,14 +37,10 @@ from vaneloop.identification.user_models.terms import (
 from vaneloop.identification.user_models.user_code import UserCode, cannot
 from vaneloop.identification.user_models.user_laws import FIRST_CODE
 
-__all__ = ["STARTS_LOADED", "Placed", "Runner"]
+__all__ = ["Placed", "Runner"]
 
-SHORT = 10_000  # steps of simulations below which a thread of its own costs more than it gains
-SWITCHED = 4  # steps between two samples at least, where something sticks, slips or stops
-FEW = 4  # samples that a cubic spline needs
 _building = Lock()  # of kernels, by one thread
 _SWITCHING = frozenset(laws.SWITCHING.tolist())
-STARTS_LOADED = 5.0  # times its noise: a measured force above that is carried by the springs at the start of a log
 
 
 @dataclass(eq=False)
@@ -201,7 +198,7 @@ class Runner:
                 one(i)
 
         todo = iter(range(len(thetas)))  # which threads share
-        if moves and threads() > 1 and not shared_out() and (len(thetas) - 1) * n * self.steps > SHORT:
+        if moves and threads() > 1 and not shared_out() and (len(thetas) - 1) * n * self.steps > SHORT_RUN:
             with ThreadPoolExecutor(1) as pool:  # compiled code runs side by side
                 other = pool.submit(work)
                 work()
@@ -316,7 +313,7 @@ class Runner:
         """Rates of the inputs at the samples where they run in a smooth curve between them: those of a cubic spline,
         float64[inputs, samples]; else none. Those not ``changed`` are as logged.
         """
-        if self.system.between != "smooth" or not len(u) or len(t) < FEW:
+        if self.system.between != "smooth" or not len(u) or len(t) < SPLINE_SAMPLES:
             return np.zeros((0, len(t)))
         if len(t) < len(self.data.times[log]):
             return SplineRates(t)(u)

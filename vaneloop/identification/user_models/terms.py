@@ -24,6 +24,7 @@ import scipy
 
 from vaneloop.base.curve import FINE, POINTS
 from vaneloop.base.forms import Form
+from vaneloop.identification.settings import AT_ONCE
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.user_models.data import Data
 from vaneloop.identification.user_models.exogenous_regressors import MINUS
@@ -55,7 +56,6 @@ HOW = {
     "force adds": 5,
 }  # fmt: skip
 SENSED = ("output adds", "output times")
-AT_ONCE = 1e-3  # of the range of what is simulated and is no state's speed, within which a jump is a straight line
 
 
 @dataclass(frozen=True)

@@ -8,18 +8,13 @@ from plant import chain, places
 from plant.effects import oil_compressibility, piston_stiction
 from plant.parameters import derive
 from plant.stages import actuator_run, step_currents
+from vaneloop.identification.settings import NEAR_STOP, RASTER, SIMPLER, SUBSTEPS, WINDOW
 from vaneloop.identification.subsystem import Array, Named, Stage, without_jumps
 from vaneloop.identification.vane_chain.parameters import declared, lanes, like_time
-from vaneloop.identification.vane_chain.resample import RASTER, SUBSTEPS, WINDOW, lately, rms
+from vaneloop.identification.vane_chain.resample import lately, rms
 from vaneloop.identification.vane_chain.subsystem_data import Driven, Made, excerpts
 
 __all__ = ["actuator_stage"]
-
-NEAR_STOP = 0.3  # mm, where a piston rests on its stop
-# mm: what a valve and piston without mass and oil spring leave of one that has them, and one inertia of motor, screw
-# and rod of two masses on a spring that rub as bristles do; logs of the rig without noise leave 0.0004, and 0.0008 to
-# 0.0015
-SIMPLER = {"hydraulic": 4e-4, "electromechanical": 1.1e-3}
 
 
 def actuator_stage(driven: Driven) -> Stage:

@@ -15,13 +15,27 @@ from vaneloop.base.curve import POINTS
 from vaneloop.base.errors import InputError
 from vaneloop.base.hysteresis import STOPS, stops_of
 from vaneloop.base.vanes import VANES
-from vaneloop.identification.candidates.spline_basis import COUNT, basis_of
+from vaneloop.identification.candidates.spline_basis import basis_of
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.selection.subsampled_search import excerpt_of
+from vaneloop.identification.settings import (
+    CURVE_SPLINES,
+    FREE_PIECE,
+    LAG_CHANGES,
+    LAG_PLACES,
+    LEARN_PIECE,
+    LONGEST_LAG,
+    MOST_SAMPLES,
+    PROBED,
+    QUICK_SAMPLES,
+    SHORT_PIECE,
+    SHORTEST_LAG,
+    TIME_SPLINES,
+)
 from vaneloop.identification.subsystem import Array, Effect, Parameter, Stage
-from vaneloop.identification.unmodelled.curve_candidates import IN_TIME, Candidate, basis_for
-from vaneloop.identification.unmodelled.regressors import LAGS, LONGEST, SHORTEST, Quantity
+from vaneloop.identification.unmodelled.curve_candidates import Candidate, basis_for
+from vaneloop.identification.unmodelled.regressors import Quantity
 from vaneloop.identification.unmodelled.spectral_lines import Course
 from vaneloop.identification.user_models.hysteresis_regressors import lagged_name
 from vaneloop.identification.user_models.law_file import CURVE_LAW
@@ -43,10 +57,6 @@ __all__ = [
     "without_laws",
 ]
 
-WHOLE = 12_000  # samples; of a longer log an excerpt is learned on, and the rest tests it
-QUICK = 4_000  # samples of the excerpt that tells which candidates to fit
-PIECE, FREE_PIECE = 1_000, 2_000  # samples in a row; of a stage that runs freely, and must find its state again
-SHORT_PIECE = 500  # of the smaller excerpt, of a stage in windows: of few long pieces all may hold the same
 SCALE = "scale"  # of a law from a file
 LOG, REST, TEST = "log", "rest of the log", "test"
 # a quantity that is the place's own output, or nothing but the reading there: it multiplies by the same as it adds
@@ -63,8 +73,6 @@ LAGGED = {  # what drives a stage, and not what it gives: curves there may have 
     "demand": ("n_dem", "n_r"), "servo": ("x_dem", "x_lvdt"), "engine": ("n_dem",),
     "actuator": ("i_cmd", "n_r", "p_s", "t_oil"), "linkage": ("x_lvdt", "speed_of_x_lvdt", "n_r", "t_oil"),
 }  # fmt: skip
-PROBED = 0.01  # of a curve's usual size by which a place is moved to see what that does
-CHANGED = 0.01  # of a channel's spread that a lag must change
 SLIPS = {  # what moves a place that may have a hysteresis: a torque motor's iron, joints on the way to the vanes
     "valve.current": "i_cmd", "linkage.crank": "x_lvdt", "linkage.ring": "x_lvdt",
     **{f"linkage.{v}_ring": "x_lvdt" for v in VANES},
@@ -170,17 +178,19 @@ class VaneChainCandidates:
         self.whole = stage
         judge = LeastSquaresProblem(stage, stage.floor)
         fit = judge.fit((), stage.neutral(), 1)
-        piece = PIECE if stage.window else FREE_PIECE
-        if stage.excerpt is not None and len(stage.t) > WHOLE:
-            at = excerpt_of(judge, fit, piece, WHOLE)
+        piece = LEARN_PIECE if stage.window else FREE_PIECE
+        if stage.excerpt is not None and len(stage.t) > MOST_SAMPLES:
+            at = excerpt_of(judge, fit, piece, MOST_SAMPLES)
             self.rest = np.ones(len(stage.t), dtype=bool)
             self.rest[at] = False
             self.whole, self.tests = stage.excerpt(at), frozenset((REST,))
         if test is not None:
             self.tests |= {TEST}
         self.small = self.whole
-        if stage.excerpt is not None and len(stage.t) > QUICK:
-            self.small = stage.excerpt(excerpt_of(judge, fit, SHORT_PIECE if stage.window else PIECE, QUICK))
+        if stage.excerpt is not None and len(stage.t) > QUICK_SAMPLES:
+            self.small = stage.excerpt(
+                excerpt_of(judge, fit, SHORT_PIECE if stage.window else LEARN_PIECE, QUICK_SAMPLES)
+            )
 
     def in_grains(self, of: float) -> None:
         """Compare errors in so large steps from now on (`Stage.grain`)."""
@@ -253,7 +263,7 @@ class VaneChainCandidates:
             values = driven.quantity(signal.name)
             if values is None or (signal.name in VANES and signal.name not in driven.machine.vanes):
                 continue
-            basis = basis_of(values[rows], IN_TIME if signal.name == "time" else COUNT)
+            basis = basis_of(values[rows], TIME_SPLINES if signal.name == "time" else CURVE_SPLINES)
             if basis is not None:
                 known.append((Quantity(signal.name, signal.unit, COLUMN, values[rows]), basis))
         late = [(c, q, b) for c in LAGGED[stage.name] for q in self._late(driven, c, rows) if (b := basis_for(q))]
@@ -306,7 +316,7 @@ class VaneChainCandidates:
         if values is None or not np.ptp(values) > 0.0:
             return []
         whole = self.driven.t
-        shortest, longest = SHORTEST * float(whole[1] - whole[0]), LONGEST * float(whole[-1] - whole[0])
+        shortest, longest = SHORTEST_LAG * float(whole[1] - whole[0]), LONGEST_LAG * float(whole[-1] - whole[0])
 
         def slow(tau: float) -> Quantity | None:
             if not 0.5 * shortest < tau < 2.0 * longest:
@@ -314,12 +324,12 @@ class VaneChainCandidates:
             name = lagged_name(channel, tau)
             late = driven.quantity(name)
             assert late is not None
-            if np.std((late - values)[rows]) < CHANGED * np.std(values[rows]):
+            if np.std((late - values)[rows]) < LAG_CHANGES * np.std(values[rows]):
                 return None
             again = lambda times: slow(tau * times)  # noqa: E731
             return Quantity(name, QUANTITIES[channel].unit, COLUMN, late[rows], (values,), again)
 
-        return [q for z in LAGS if (q := slow(shortest * (longest / shortest) ** z)) is not None]
+        return [q for z in LAG_PLACES if (q := slow(shortest * (longest / shortest) ** z)) is not None]
 
     def _idle(self, place: Place, q: str, stage: str) -> bool:
         """Whether a curve there would say nothing of its own in a stage."""

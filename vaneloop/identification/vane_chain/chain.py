@@ -34,23 +34,15 @@ from plant.effects import CURVES
 from plant.layout import C_OF, CURVE_ROWS, MOST_CURVES
 from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES, same_stages
+from vaneloop.identification.settings import CHAIN_MEMORY, CURRENT_DRAWS, LEAST_FLOOR, RASTER, SETTLE
 from vaneloop.identification.subsystem import Array, Stage, noise_of
 from vaneloop.identification.vane_chain.actuator import actuator_stage
 from vaneloop.identification.vane_chain.candidates import OF_STROKE, reversals, room_for
-from vaneloop.identification.vane_chain.current import (
-    DRAWS,
-    SAMPLED,
-    between_rows,
-    other_current,
-    servo_law,
-    without_noise,
-)
+from vaneloop.identification.vane_chain.current import SAMPLED, between_rows, other_current, servo_law, without_noise
 from vaneloop.identification.vane_chain.demand import demand_stage, own_demand_stage
 from vaneloop.identification.vane_chain.engine import engine_stage
 from vaneloop.identification.vane_chain.linkage import linkage_stage
 from vaneloop.identification.vane_chain.resample import (
-    RASTER,
-    SETTLE,
     Grid,
     every_other,
     grid_of,
@@ -67,14 +59,6 @@ from vaneloop.identification.vane_chain.subsystem_data import Driven
 __all__ = ["STAGE_ORDER", "Chain", "build_chain"]
 
 STAGE_ORDER = ("demand", "servo", "engine", "actuator", "linkage")
-MEMORY = 10.0  # s, longer than any stage here remembers
-LEAST_FLOOR = {
-    "demand": 2e-3,
-    "servo": 1e-3,
-    "engine": 1e-4,
-    "actuator": 1e-4,
-    "linkage": 1e-3,
-}  # border units: nobody measures finer
 
 
 @dataclass(eq=False)
@@ -114,7 +98,7 @@ def build_chain(
     present: tuple[str, ...] = (),
     grid: Grid | None = None,
     pieces: Sequence[tuple[int, int]] = (),
-    draws: int = DRAWS,
+    draws: int = CURRENT_DRAWS,
 ) -> Chain:
     """Put ``log`` on one raster and make every stage that its channels allow.
 
@@ -254,7 +238,7 @@ def build_chain(
             channel = noise_floor(t, stage.measured[0])
             freed = noise_floor(t, np.where(np.isfinite(stage.measured[0]), smooth.off, np.nan))
             stage.quiet = np.maximum([min(channel, freed)], least)
-        stage.memory = MEMORY
+        stage.memory = CHAIN_MEMORY
         stage.noise = lambda when, error, least=least: max(noise_floor(when, error), least)
         stage.floor = noise_of(stage, stage.neutral())
         stages.append(stage)

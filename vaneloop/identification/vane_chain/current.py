@@ -17,28 +17,28 @@ from plant.stages import actuator_run, step_currents
 from plant.stages.blocks import NOTHING
 from vaneloop.base.compiled import compiled
 from vaneloop.base.spline_rates import SplineRates
+from vaneloop.identification.settings import (
+    CURRENT_DRAWS,
+    CURRENT_LAGS,
+    FLOW_BENDS,
+    RASTER,
+    SMOOTH_ORDER,
+    SMOOTH_ROWS,
+    SMOOTH_WINDOW,
+    SUBSTEPS,
+    TRIANGLE_ROWS,
+    WINDOW,
+)
 from vaneloop.identification.subsystem import Array
-from vaneloop.identification.vane_chain.resample import RASTER, SUBSTEPS, WINDOW
 
-__all__ = [
-    "BEFORE",
-    "DRAWS",
-    "SAMPLED",
-    "SMOOTH",
-    "Smooth",
-    "between_rows",
-    "other_current",
-    "servo_law",
-    "without_noise",
-]
+__all__ = ["BEFORE", "SAMPLED", "Smooth", "between_rows", "other_current", "servo_law", "without_noise"]
 
 SAMPLED = "the current of the tick at each row"
-DRAWS = 8  # of what the log hides: the integral wanders, so that one draw says little of a stretch of the log
 BEFORE = "the mean of the ten ticks before the row"
 
 
 def servo_law(
-    t: Array, c: dict[str, Array], cal: Calibration, smooth: Smooth, draws: int = DRAWS
+    t: Array, c: dict[str, Array], cal: Calibration, smooth: Smooth, draws: int = CURRENT_DRAWS
 ) -> tuple[Array, Array, Array]:
     """What the firmware's servo loop makes of logged demand and stroke, but for a constant of its integral.
 
@@ -129,7 +129,7 @@ def between_rows(
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal(law.shape)
     noise[:, -1] = 0.0
-    slow = scipy.ndimage.uniform_filter1d(c["i_cmd"] - law.mean(axis=1), SMOOTH[-1])  # the integral's constant
+    slow = scipy.ndimage.uniform_filter1d(c["i_cmd"] - law.mean(axis=1), SMOOTH_ROWS[-1])  # the integral's constant
     ticks = law + slow[:, None] + size * noise
     # the row's own tick is known; the others' noise was such that the mean comes out
     ticks[:, :-1] += (c["i_cmd"] - ticks.mean(axis=1))[:, None] * (law.shape[1] / (law.shape[1] - 1.0))
@@ -165,13 +165,6 @@ def other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Ca
 
 
 # ---- The logged stroke with less of the LVDT's noise in it
-
-SMOOTH = (9, 15, 25, 41)  # rows over which the stroke's noise may be smoothed
-SMOOTH_ORDER = 3
-PIECE = 4_000  # rows of which one triangle is made at a time
-AROUND = 1.0  # s: over which what smoothing bends is told from noise
-LAGS = (0.01, 0.03, 0.1)  # s: lags of valve and LVDT by which the motion may trail the model's, as a sum of them
-BENDS = (0.3, 0.6, 0.85, 0.97)  # shares of the rows that move less: where the curve of flow over opening may bend
 
 
 class Smooth(NamedTuple):
@@ -221,7 +214,7 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = 
     model = np.cumsum(np.where(whole, calibrated, logged))  # over a gap the model goes where the stroke went
     off = c["x_lvdt"] - model
     tried = []
-    for rows in SMOOTH:
+    for rows in SMOOTH_ROWS:
         smooth, own = _smoothed(off, rows), _weights(rows)[rows // 2]
         left = float(np.mean((off - smooth) ** 2)) / (1.0 - own)  # white noise leaves 1 - own of its power
         tried.append((left / (1.0 - own), rows, np.sqrt(left), smooth))
@@ -233,14 +226,14 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = 
     wide, narrow, as_is = _weights(rows), np.zeros(rows), np.zeros(rows)
     narrow[(rows - half) // 2 : (rows + half) // 2] = _weights(half)
     as_is[rows // 2] = 1.0
-    around = int(round(AROUND / dt))
+    around = int(round(SMOOTH_WINDOW / dt))
     bent = np.maximum(
         _above_noise(differs, wide - narrow, noise, around), _above_noise(off - smooth, as_is - wide, noise, around)
     )
     distortion = differs * np.sqrt(bent / np.maximum(scipy.ndimage.uniform_filter1d(differs**2, around), 1e-300))
     # and what the model of the motion leaves at each row, in proportion to how fast the motion changes: least squares
     jerky = scipy.ndimage.uniform_filter1d(
-        (calibrated - scipy.ndimage.uniform_filter1d(calibrated, SMOOTH[0])) ** 2, around
+        (calibrated - scipy.ndimage.uniform_filter1d(calibrated, SMOOTH_ROWS[0])) ** 2, around
     )
     jerky = np.maximum(jerky, 0.0)  # a running sum of squares may end a rounding below 0
     weights = as_is - wide
@@ -257,13 +250,13 @@ def _calibrated(step: Array, dt: float, logged: Array, whole: Array) -> Array:
 
     Least squares by triangles of the rows piece by piece, which stay in the processor's cache.
     """
-    bends = [0.0, *np.quantile(np.abs(step), BENDS)]
-    late = [_lagged(step, 1.0 - np.exp(-dt / lag)) for lag in LAGS]
+    bends = [0.0, *np.quantile(np.abs(step), FLOW_BENDS)]
+    late = [_lagged(step, 1.0 - np.exp(-dt / lag)) for lag in CURRENT_LAGS]
     around = np.concatenate([step[-1:], step, step[:1]])
     pieces, triangles = [], []
-    for i in range(0, len(step), PIECE):
-        at = slice(i, i + PIECE)
-        steps = around[i : i + PIECE + 2]
+    for i in range(0, len(step), TRIANGLE_ROWS):
+        at = slice(i, i + TRIANGLE_ROWS)
+        steps = around[i : i + TRIANGLE_ROWS + 2]
         sides = [np.maximum(side * steps - bend, 0.0) for side in (1.0, -1.0) for bend in bends]
         shifted = [moved for side in sides for moved in (side[2:], side[1:-1], side[:-2])]
         null = np.ones(len(shifted[0]))

@@ -12,9 +12,10 @@ from hil.native.call import firmware
 from plant.curve import DEMAND_ADDS
 from plant.effects import ROW
 from vaneloop.base.compiled import compiled, compiled_free
+from vaneloop.identification.settings import APPROACH, DEMAND_SAME, RASTER, WARM_FRAMES
 from vaneloop.identification.subsystem import Array, Effect, Parameter, Stage
 from vaneloop.identification.vane_chain.parameters import bends, declared
-from vaneloop.identification.vane_chain.resample import RASTER, lately, pieces_of
+from vaneloop.identification.vane_chain.resample import lately, pieces_of
 from vaneloop.identification.vane_chain.subsystem_data import Driven, Made
 
 __all__ = ["demand_stage", "own_demand_stage"]
@@ -163,10 +164,6 @@ def demand_stage(driven: Driven) -> Stage:
 
 # ---- Stage `demand` of a controller of the user's own: the stroke demand that it makes of logged speeds
 
-WARM = 200  # frames before the log: the controller comes to RUN and its demand settles
-APPROACH = 4.0  # %, from where the demand comes in them: from below, and from above
-SAME = 1e-6  # m: what the controller remembers from before the log makes no difference any more
-
 
 @compiled_free
 def _run(
@@ -184,15 +181,15 @@ def _run(
 ) -> None:
     """Run a controller on a frame every 10 ms, its piston from ``start`` (m) on: x_dem (m) of every frame.
 
-    before  %, by which the demand begins below the log's first one, `WARM` frames before it
+    before  %, by which the demand begins below the log's first one, `WARM_FRAMES` frames before it
     """
     fed, given = as_inputs(inputs), as_outputs(outputs)
     n, x = len(n_dem), start
     scalars = as_scalars(calibration.k)
     per_ampere = 1.0 / scalars.kff if scalars.kff > 0.0 else scalars.stroke_rate / scalars.current_limit
-    for i in range(-WARM, n):
+    for i in range(-WARM_FRAMES, n):
         j = max(i, 0)
-        to_go = 0.0 if i >= -WARM // 2 else 2.0 * (-i - WARM // 2) / WARM
+        to_go = 0.0 if i >= -WARM_FRAMES // 2 else 2.0 * (-i - WARM_FRAMES // 2) / WARM_FRAMES
         fed.n_dem, fed.n_r = n_dem[j] - before * to_go, n_r[j] - before * to_go
         for q in range(angles.shape[0]):
             fed.pots[q] = angles[q, j]
@@ -239,6 +236,6 @@ def own_demand_stage(driven: Driven) -> Stage:
         return np.array([[demanded(theta, APPROACH) * 1e3] for theta in thetas])
 
     neutral = Stage("demand", outputs, ("mm",), (), effects, simulate, t, c["x_dem"][None]).neutral()
-    differs = np.abs(demanded(neutral, APPROACH) - demanded(neutral, -APPROACH)) > SAME
+    differs = np.abs(demanded(neutral, APPROACH) - demanded(neutral, -APPROACH)) > DEMAND_SAME
     rows = run & ~lately(differs, 0.5) & ~lately(c["missing"] > 0.0, 0.4)
     return Stage("demand", outputs, ("mm",), (), effects, simulate, t, np.where(rows, c["x_dem"], np.nan)[None])

@@ -6,9 +6,10 @@ import numpy as np
 
 from plant import chain, places
 from plant.stages import engine_run
+from vaneloop.identification.settings import RASTER
 from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.vane_chain.parameters import declared, lanes
-from vaneloop.identification.vane_chain.resample import RASTER, pieces_of
+from vaneloop.identification.vane_chain.resample import pieces_of
 from vaneloop.identification.vane_chain.subsystem_data import Driven, Made
 
 __all__ = ["engine_stage"]

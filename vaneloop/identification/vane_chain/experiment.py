@@ -17,25 +17,16 @@ from plant import Model, build_plant
 from plant.effects import EFFECTS
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import floor_of
-from vaneloop.identification.selection.likelihood_acceptance import (
-    NATS,
-    RIVAL_SPREADS,
-    LikelihoodAcceptance,
-    correlation_of,
-    gain,
-)
+from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, correlation_of, gain
 from vaneloop.identification.selection.search import Search
+from vaneloop.identification.settings import MARGIN, MOST_REPEATS, NATS, RIVAL_SPREADS
 from vaneloop.identification.vane_chain.chain import build_chain
 
 if TYPE_CHECKING:
     from controller import Calibration
     from plant import Plant
 
-__all__ = ["MARGIN", "MOST_REPEATS", "divergence", "profiles", "recommend"]
-
-MOST_REPEATS = 4  # of a profile, where once does not decide
-
-MARGIN = 2.0  # times what decides: the machine is not the model, and its noise is another
+__all__ = ["divergence", "profiles", "recommend"]
 
 
 def _piecewise(points: list[tuple[float, float]]) -> np.ndarray:

@@ -7,9 +7,10 @@ import numpy as np
 from plant.parameters import derive
 from plant.stages import linkage_run
 from plant.stages.linkage import speed_reach
+from vaneloop.identification.settings import SETTLE
 from vaneloop.identification.subsystem import Array, Named, Stage
 from vaneloop.identification.vane_chain.parameters import declared, lanes, like_temperature, like_time
-from vaneloop.identification.vane_chain.resample import SETTLE, pieces_of, since
+from vaneloop.identification.vane_chain.resample import pieces_of, since
 from vaneloop.identification.vane_chain.subsystem_data import Driven, Made, excerpts
 
 __all__ = ["linkage_stage"]

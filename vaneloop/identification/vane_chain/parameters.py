@@ -16,6 +16,7 @@ from plant.geometry import STANDS_FOR
 from plant.model import allowed_of
 from plant.stages import run_bends
 from vaneloop.base.vanes import VANES, vane_in
+from vaneloop.identification.settings import EFFECT_FACTORS, EFFECT_SIZES, SHAPE_KNOWN, SHAPE_STARTS
 from vaneloop.identification.subsystem import Array, Effect, Parameter
 from vaneloop.identification.user_models.terms import Curve
 from vaneloop.identification.vane_chain.subsystem_data import Driven
@@ -44,13 +45,7 @@ FREE = {  # nominal parameters that a stage refits within their tolerance, those
         *(f"linkage.{s}_{length}" for s in VANES for length in STANDS_FOR),
     ),
 }
-SIZES = (0.003, 0.03, 0.2, 0.6)  # of the way from neutral to a bound
-FIXED_START = {"speed": 5.0, "distance": 0.3, "spread": 0.6}  # of second parameters
-SHAPES = (*FIXED_START, "phase", "roundness")
-KNOWN = {
-    "drag": 0.5
-}  # half-width, of its neutral value, to which a second parameter is known: few logs show it by itself
-FACTORS = (0.8, 0.95, 0.99, 1.01, 1.05, 1.25)
+SHAPES = (*SHAPE_STARTS, "phase", "roundness")
 
 
 def declared(stage: str, driven: Driven) -> tuple[tuple[Parameter, ...], tuple[Effect, ...], Array, Array]:
@@ -90,7 +85,7 @@ def declared(stage: str, driven: Driven) -> tuple[tuple[Parameter, ...], tuple[E
                 p.unit,
                 p.low,
                 p.high,
-                KNOWN.get(p.name, 0.0) * p.neutral,
+                SHAPE_KNOWN.get(p.name, 0.0) * p.neutral,
                 p.vane or None,
                 shape=p.name in SHAPES,
                 period=p.period,
@@ -118,10 +113,10 @@ def _starts(name: str, ps: tuple[Parameter, ...]) -> tuple[tuple[float, ...], ..
         return tuple((float(v),) for v in np.geomspace(0.1, 12.0, 121))
     if name == "end_stop_shift":
         return tuple((s * v,) for v in (1.0, 2.0, 4.0, 7.0) for s in (-1.0, 1.0))
-    second = [FIXED_START.get(p.name, p.value) for p in ps]
+    second = [SHAPE_STARTS.get(p.name, p.value) for p in ps]
     mains = [i for i, p in enumerate(ps) if p.name not in SHAPES]
     out = []
-    for size in SIZES if ps[mains[0]].value == 0.0 else range(len(FACTORS)):
+    for size in EFFECT_SIZES if ps[mains[0]].value == 0.0 else range(len(EFFECT_FACTORS)):
         for sign in (1.0, -1.0):
             start = list(second)
             ok = True
@@ -130,7 +125,7 @@ def _starts(name: str, ps: tuple[Parameter, ...]) -> tuple[tuple[float, ...], ..
                 if p.value == 0.0:
                     v = sign * size * (p.high if sign > 0 else -p.low)
                 else:
-                    v = p.value * FACTORS[int(size)]
+                    v = p.value * EFFECT_FACTORS[int(size)]
                     ok &= sign > 0
                 ok &= p.low <= v <= p.high and v != p.value
                 start[i] = v

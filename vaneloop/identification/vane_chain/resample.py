@@ -14,13 +14,10 @@ from hil.logs import Channel, Log, LogError
 from hil.logs.held import COMMANDS, answers, held, taken
 from vaneloop.base.compiled import compiled
 from vaneloop.base.sizes import no_smaller
+from vaneloop.identification.settings import RASTER, WINDOW
 from vaneloop.identification.subsystem import Array, Stage
 
 __all__ = [
-    "RASTER",
-    "SETTLE",
-    "SUBSTEPS",
-    "WINDOW",
     "Grid",
     "every_other",
     "grid_of",
@@ -33,11 +30,6 @@ __all__ = [
     "since",
     "stretches",
 ]
-
-RASTER = 1e-2  # s
-WINDOW = 1.0  # s
-SUBSTEPS = 5  # of the actuator between two samples of 10 ms
-SETTLE = 3.0  # s at the start of a log that do not count: filters, lags and play forget how they started
 
 
 class Grid(NamedTuple):

@@ -6,9 +6,10 @@ import numpy as np
 
 from hil.figures import noise_floor
 from plant.curve import QUANTITIES, SERVO_ADDS, SERVO_TIMES
-from vaneloop.identification.subsystem import KNOWN_TO, Array, Stage, without_jumps
+from vaneloop.identification.settings import NOISE_KNOWN_TO, WINDOW
+from vaneloop.identification.subsystem import Array, Stage, without_jumps
 from vaneloop.identification.vane_chain.parameters import bends, declared
-from vaneloop.identification.vane_chain.resample import WINDOW, no_gap_in_window, rms
+from vaneloop.identification.vane_chain.resample import no_gap_in_window, rms
 from vaneloop.identification.vane_chain.subsystem_data import Driven, Made
 
 __all__ = ["servo_stage"]
@@ -54,7 +55,7 @@ def servo_stage(driven: Driven) -> Stage:
     # noise are one noise
     drawn = float(np.mean([noise_floor(t, h) for h in hidden]))
     own = noise_floor(t, without_jumps(stage, stage.measured[0] - mean))
-    seen = own if own < (1.0 + KNOWN_TO) * drawn else drawn
+    seen = own if own < (1.0 + NOISE_KNOWN_TO) * drawn else drawn
     whole = np.mean([rms(stage, h[None]) ** 2 for h in hidden], axis=0)
     stage.raster_error = np.sqrt(np.maximum(whole - seen**2, 0.0))
     return stage

@@ -1,0 +1,55 @@
+"""The thresholds of the identification as a page: ``python -m benchmarks.settings`` prints it, with ``--write`` it is
+written to docs/settings.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+from itertools import groupby
+
+from benchmarks.measure import ROOT
+from vaneloop.base.files import write
+from vaneloop.identification.settings import RECORD
+
+PAGE = ROOT / "docs" / "settings.md"
+BEGINNING = """# Thresholds of the identification
+
+Every number that decides what `locate`, `diagnose`, `extend` and `learn` answer, or how long they take. All stand in
+`vaneloop/identification/settings.py`; `python -m benchmarks.settings --write` writes this page.
+[How the search decides](methods.md) says where the main ones enter.
+
+Below each value stands its unit, below each meaning the origin of the value. An origin begins with its kind: a
+principle, physics, numerics, a benchmark that chose the value, a budget of work, or a judgement where nothing else
+decides. The unit 1 is a pure number. A unit in the plural counts or multiplies what it names: `noise floors`, `scales`.
+"""
+
+
+def page() -> str:
+    """docs/settings.md: a table for each heading, of two rows for each threshold."""
+    parts = [BEGINNING]
+    for heading, rows in groupby(RECORD.items(), lambda row: row[1].heading):
+        parts.append(f"\n## {heading}\n\n| threshold | value, unit | meaning, origin |\n|---|---|---|\n")
+        for name, s in rows:
+            parts.append(f"| `{name}` | {shown(s.value)} | {s.meaning} |\n| | {s.unit} | {s.origin} |\n")
+    return "".join(parts)
+
+
+def shown(value: object) -> str:
+    """A value as the page shows it: numbers as Python writes them, several with commas, named ones with their names."""
+    if isinstance(value, dict):
+        return "; ".join(f"{name}: {shown(v)}" for name, v in value.items())
+    return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def main() -> None:
+    """Print the page, or write it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--write", action="store_true", help="write docs/settings.md")
+    if parser.parse_args().write:
+        write(PAGE, page())
+    else:
+        print(page(), end="")
+
+
+if __name__ == "__main__":
+    main()
