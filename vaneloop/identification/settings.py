@@ -51,7 +51,7 @@ LEAST_STEP_FALL = setting(
     1e-3,
     "share",
     "A fit goes on where a step lowers its cost by this share, if the model's own parameters are known roughly.",
-    "budget of work: smaller steps change no decision",
+    "budget of work: parameters that are known roughly creep on for long",
 )
 DAMPING_TIMES = setting(
     (0.01, 1.0, 300.0),
@@ -75,7 +75,7 @@ CARRIED_STEP = setting(
     0.34,
     "iterations",
     "A step by carried slopes counts as at least this part of an iteration.",
-    "budget of work: three such steps cost about what one with new slopes does",
+    "budget of work: at most three such steps for one",
 )
 CARRIED_VALUES = setting(
     400_000, "values", "One fit carries at most so many values of slopes along.", "budget of work: 3 MB"
@@ -132,13 +132,13 @@ FLOOR_KNOWN = setting(
     0.01,
     "share",
     "A noise floor that was estimated from a log is known to this relative error.",
-    "benchmark: clean logs of hidden_effect stand within 1 % of the estimated floor",
+    "benchmark: clean logs stand within 1 % of the estimated floor",
 )
 NOISE_KNOWN_TO = setting(
     0.05,
     "share",
     "Two estimates of one noise differ by up to this share on a clean log of some 100 s.",
-    "benchmark: clean logs of hidden_effect",
+    "benchmark: clean logs",
 )
 PIECE_BLOCKS = setting(
     6,
@@ -153,7 +153,7 @@ FORM_STEPS = setting(
     30,
     "steps",
     "The fit of a closed form to a curve takes at most so many steps from one start.",
-    "budget of work: most forms need fewer",
+    "budget of work: bounds the fit of each form",
 )
 FORM_DAMPING = setting(
     1.0,
@@ -183,7 +183,7 @@ CURVE_SPLINES = setting(
     10,
     "splines",
     "A curve is made of so many cubic B-splines.",
-    "benchmark: learn; the bending prior decides how many count",
+    "judgement: the prior of the bending decides how many count",
 )
 LEAST_SPLINES = setting(
     5,
@@ -216,7 +216,7 @@ WAVE_SPLINES = setting(
     9,
     "splines",
     "Each wave of a periodic curve is made of so many splines.",
-    "numerics: error of a cubic spline of a sine below the noise of a log",
+    "numerics: so many cubic splines follow a sine closely",
 )
 EDGE_SHARE = setting(
     0.001,
@@ -237,7 +237,7 @@ NATS = setting(
     12.0,
     "nats",
     "An effect must raise the log-likelihood by more than this.",
-    "benchmark: hidden_effect; the best useless effect of the library stays below in 99 of 100 clean logs, with margin",
+    "benchmark: the best useless effect of the library stays below in 99 of 100 clean logs, with margin",
 )
 SPREADS = setting(
     3.0,
@@ -261,7 +261,7 @@ RIVAL_SPREADS = setting(
     0.3,
     "standard deviations",
     "One of two accepted effects must have the smaller error by so many standard deviations to beat the other.",
-    "benchmark: hidden_effect; more than useless effects gain by errors of form on clean logs",
+    "benchmark: more than useless effects gain by errors of form on clean logs",
 )
 CREDIBLE = setting(
     0.9,
@@ -279,7 +279,7 @@ TOLERATED = setting(
     1.05,
     "noise floors",
     "Nothing is missing any more where the error is at most so many noise floors.",
-    "benchmark: clean logs of hidden_effect",
+    "principle: as FLOOR_KNOWN, after the search",
 )
 LEAST_SHARE = setting(
     0.15,
@@ -303,7 +303,7 @@ LEAST_FALL = setting(
     0.20,
     "share",
     "An effect must lower the held-out sum of squares beyond noise by this share.",
-    "benchmark: hidden_law; 10 % of the RMS, far above the noise",
+    "judgement: 10 % of the RMS, far above the noise",
 )
 LEAST_OF_NOISE = setting(
     0.10,
@@ -321,9 +321,11 @@ LEAST_HELP = setting(
     0.75,
     "share",
     "This share of the summed changes of log error over the blocks must be improvement.",
-    "benchmark: hidden_law",
+    "judgement: three quarters, so that no single block decides",
 )
-AGREE = setting(0.05, "log mean square", "Two blocks at least must improve by this.", "benchmark: hidden_law")
+AGREE = setting(
+    0.05, "log mean square", "Two blocks at least must improve by this.", "judgement: 5 % of the mean square"
+)
 FLAT = setting(
     0.1,
     "share",
@@ -331,24 +333,27 @@ FLAT = setting(
     "numerics: a logarithm of next to nothing would decide alone",
 )
 PER_PARAMETER = setting(
-    0.01, "log error", "A parameter costs this where sets of effects are compared.", "benchmark: hidden_law"
+    0.01, "log error", "A parameter costs this where sets of effects are compared.", "judgement: a fifth of RIVAL"
 )
 RIVAL = setting(
     0.05,
     "log error",
     "Two candidates do equally well within this.",
-    "benchmark: hidden_law; validation logs decide between them",
+    "judgement: validation logs then decide between them",
 )
 BETTER = setting(
-    0.02, "log error", "One candidate must be better by this to be exchanged for another.", "benchmark: hidden_law"
+    0.02,
+    "log error",
+    "One candidate must be better by this to be exchanged for another.",
+    "judgement: worth of two parameters (PER_PARAMETER)",
 )
-HARM = setting(0.10, "log error", "A validation log may get worse by no more than this.", "benchmark: hidden_law")
-LEAST_USE = setting(0.02, "log error", "Some log must get better by at least this.", "benchmark: hidden_law")
+HARM = setting(0.10, "log error", "A validation log may get worse by no more than this.", "judgement: twice RIVAL")
+LEAST_USE = setting(0.02, "log error", "Some log must get better by at least this.", "judgement: as BETTER")
 UNKNOWN = setting(
     1.25,
     "noise RMS",
     "What is left is no noise where it exceeds the most noise that the samples can hold so many times.",
-    "judgement: whatever predicts it",
+    "judgement: 25 % above what noise can be",
 )
 MOST_LEFT = setting(
     0.25,
@@ -429,7 +434,7 @@ AHEAD_SAMPLES = setting(
     8_000,
     "samples",
     "The excerpt that is searched ahead of a whole log has about so many.",
-    "budget of work: benchmark hidden_effect finds the same effects",
+    "budget of work: what is found on it is fitted to the whole log",
 )
 LITTLE_TOLD = setting(
     0.5,
@@ -459,7 +464,7 @@ LEAST_PROMISE = setting(
     0.5,
     "share",
     "An effect must promise this share of the gain that it needs (NATS), or it is not fitted.",
-    "budget of work: a linearised gain errs by less than a factor of two where an effect is small",
+    "budget of work: half, for a linearised gain is rough",
 )
 SIZES_AGREE = setting(
     0.5,
@@ -498,7 +503,7 @@ CORRELATION = setting(
     2.0,
     "samples",
     "So many count as one where errors are looked at bin by bin.",
-    "benchmark: the most that clean logs of hidden_effect show",
+    "benchmark: the most that clean logs show",
 )
 REGIME_BINS = setting(
     8,
@@ -543,7 +548,10 @@ FORM_SHAPED = setting(
     "budget of work: others are not its shape",
 )
 FORM_FAR = setting(
-    100.0, "curve ranges", "A formula's range may be so many times its curve's.", "numerics: it overflows beyond"
+    100.0,
+    "curve ranges",
+    "A formula's range may be so many times its curve's.",
+    "judgement: what goes so far is not the curve's shape",
 )
 FORM_SAME = setting(
     0.02,
@@ -702,7 +710,7 @@ MAY_CATCH_UP = setting(
     0.25,
     "log error",
     "A candidate within this of the best after its first fit may still do as well.",
-    "judgement: what longer fits and finer splines have changed at most",
+    "judgement: longer fits and finer splines may change as much",
 )
 LAG_TIMES = setting(
     (1.8, 1.3, 1.1, 1.03),
@@ -737,13 +745,13 @@ FINE_SPLINES = setting(
 FORMULA_MAY_EARN = setting(
     0.25,
     "log error",
-    "A curve that misses acceptance by up to this may earn its place by a formula.",
+    "A curve within this of the best that does not earn its place may do so by a formula.",
     "judgement: a formula has fewer parameters",
 )
 NOT_INSTEAD = setting(
     0.5,
     "log error",
-    "What harms no validation log is not taken instead of what does where it is worse by this.",
+    "What harms no validation log is not taken instead of what does where it is worse than the best by this.",
     "judgement: ten times RIVAL",
 )
 LEAST_PARAMETER_LEFT = setting(
@@ -980,7 +988,7 @@ WIDE = setting(
     4.0,
     "sizes",
     "A parameter that the user calls unknown may move this far each way in later fits.",
-    "judgement: beyond a factor of ten for a size",
+    "judgement: wide, so that the log decides",
 )
 GIVEN = setting(
     12.0,
@@ -998,13 +1006,13 @@ START_DRAWS = setting(
     3,
     "draws",
     "A model starts from so many of the noise to see what noise in its start does.",
-    "budget of work: an order of magnitude is enough",
+    "budget of work: each is a simulation",
 )
 START_FORGOTTEN = setting(
     0.2,
     "noise RMS",
     "A start that a reading's noise moves an output by less than this is not fitted.",
-    "principle: 2 % of the noise's power",
+    "principle: it then adds 2 % to the RMS",
 )
 START_STEP = setting(
     0.1, "noise RMS", "A start is moved by this to see what it does.", "numerics: small against the noise"
@@ -1105,8 +1113,8 @@ LONGEST_SPIKE = setting(
 SPIKE_FAR = setting(
     10.0,
     "usual distances",
-    "A spike stands so far off the line between its neighbours, in what all but 3 % of the samples stay within.",
-    "judgement: ten times what is usual",
+    "A spike stands so far off the line between its neighbours.",
+    "judgement: ten times what all but 3 % of the samples stay within",
 )
 SPIKE_BACK = setting(
     0.1,
@@ -1209,9 +1217,7 @@ AT_ONCE = setting(
 
 # ---- Vane chain -----------------------------------------------------------------------------------------------------
 under("Vane chain")
-NEAR_STOP = setting(
-    0.3, "mm", "A piston rests on its stop within this.", "physics: elastic travel of a stop and play of the LVDT"
-)
+NEAR_STOP = setting(0.3, "mm", "A piston rests on its stop within this.", "judgement: a stop is known no better")
 SIMPLER = setting(
     {"hydraulic": 4e-4, "electromechanical": 1.1e-3},
     "mm",
@@ -1276,7 +1282,7 @@ CURRENT_LAGS = setting(
     (0.01, 0.03, 0.1),
     "s",
     "The motion may trail the model's by a sum of these lags of valve and LVDT.",
-    "physics: valve and demodulator, with half a decade to each side",
+    "physics: lags of valve and LVDT, half a decade apart",
 )
 FLOW_BENDS = setting(
     (0.3, 0.6, 0.85, 0.97),
@@ -1342,9 +1348,7 @@ WINDOW = setting(
     "A subsystem that integrates is compared in windows of this length.",
     "judgement: shorter than its drift, longer than a step",
 )
-SUBSTEPS = setting(
-    5, "steps", "The actuator makes so many between two samples.", "numerics: 2 ms, below its fastest time constant"
-)
+SUBSTEPS = setting(5, "steps", "The actuator makes so many between two samples.", "numerics: steps of 2 ms")
 SETTLE = setting(
     3.0, "s", "So much at the start of a log does not count.", "physics: filters, lags and play forget how they started"
 )
