@@ -14,8 +14,8 @@ from vaneloop.identification.settings import RECORD
 PAGE = ROOT / "docs" / "settings.md"
 BEGINNING = """# Thresholds of the identification
 
-Every number that decides what `locate`, `diagnose`, `extend` and `learn` answer, or how long they take. All stand in
-`vaneloop/identification/settings.py`; `python -m benchmarks.settings --write` writes this page.
+The named numbers that decide what `locate`, `diagnose`, `extend` and `learn` answer, or how long they take. They
+stand in `vaneloop/identification/settings.py`; `python -m benchmarks.settings --write` writes this page.
 [How the search decides](methods.md) says where the main ones enter.
 
 Below each value stands its unit, below each meaning the origin of the value. An origin begins with its kind: a
