@@ -197,8 +197,8 @@ def two_minutes() -> Iterator[Row]:
             began = time.perf_counter()
             file.set_input_files(str(ROOT / "examples" / "hidden_effect.parquet"))
             if k:
-                page.get_by_text("fails most in the actuator stage").wait_for(state="detached")
-            page.get_by_text("fails most in the actuator stage").wait_for()
+                page.get_by_text("fails most in the actuator subsystem").wait_for(state="detached")
+            page.get_by_text("fails most in the actuator subsystem").wait_for()
             dropped.append(time.perf_counter() - began)
             began = time.perf_counter()
             page.get_by_role("button", name="Find the missing physics").click()

@@ -252,7 +252,7 @@ def test_missing_physics_from_the_log_to_the_falling_error(server: Server, page:
     for _ in range(1 + page.evaluate(chosen)):
         page.keyboard.press("ArrowDown")
     page.keyboard.press("Enter")
-    page.get_by_text("fails most in the actuator stage").wait_for()
+    page.get_by_text("fails most in the actuator subsystem").wait_for()
     holds_focus(page, ".choose input")  # drawn anew meanwhile
     tab_to(page, "[aria-label^='failure map']")
     for key in ("ArrowDown", "ArrowRight", "ArrowUp"):  # the lowest row has no eight cells
@@ -421,7 +421,7 @@ def test_a_page_that_fails_inside_says_so_in_a_plain_line(browser: Any, tmp_path
         page.goto(server.at(""))
         choose(page, "hidden_effect.parquet")
         page.get_by_role("alert").filter(has_text="a part of this page failed").wait_for()
-        page.get_by_text("fails most in the actuator stage").wait_for()  # the other parts go on
+        page.get_by_text("fails most in the actuator subsystem").wait_for()  # the other parts go on
         page.get_by_role("button", name="Find the missing physics").click()
         page.get_by_text(re.compile("so far: .* fits")).first.wait_for()  # stages as they finish
         page.get_by_text("subsystems searched").wait_for()
