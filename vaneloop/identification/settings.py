@@ -45,7 +45,7 @@ EVIDENCE = setting(
     200.0,
     "observations",
     "A log counts as at most so many independent observations of an output when intervals are made.",
-    "benchmark: intervals cover the truth of the rig's logs as often as they say; errors of form do not average out",
+    "benchmark: intervals cover the simulated truth as often as they say; errors of form do not average out",
 )
 LEAST_STEP_FALL = setting(
     1e-3,
@@ -235,7 +235,7 @@ STRAY_RANGE = setting(
 under("Selection")
 NATS = setting(
     12.0,
-    "nats",
+    "log-likelihood",
     "An effect must raise the log-likelihood by more than this.",
     "benchmark: the best useless effect of the library stays below in 99 of 100 clean logs, with margin",
 )
@@ -253,7 +253,7 @@ BLOCK_SPREADS = setting(
 )
 RIVAL_NATS = setting(
     3.0,
-    "nats",
+    "log-likelihood",
     "One of two accepted effects must lead by this log-likelihood to beat the other.",
     "principle: odds of 20 to 1",
 )
@@ -439,7 +439,7 @@ AHEAD_SAMPLES = setting(
 LITTLE_TOLD = setting(
     0.5,
     "share",
-    "A piece tells little where it has less than this share of what counts in the best piece.",
+    "A piece says little where it has less than this share of what counts in the best piece.",
     "judgement: half of the excerpt must be worth its place",
 )
 SHORT_PIECE = setting(
@@ -524,7 +524,7 @@ FORMS_ALIKE = setting(
     1e-4,
     "share",
     "Two formulas are alike where they differ by less than this share of the curve's variance.",
-    "judgement: 1 % of the RMS, which nobody sees in a log",
+    "judgement: 1 % of the RMS, which no log shows",
 )
 FORMS_REFITTED = setting(
     5, "formulas", "So many are fitted in the simulation in a curve's place.", "budget of work: the nearest ones"
@@ -628,7 +628,7 @@ BAND = setting(
 VISITED_BINS = setting(
     24,
     "bins",
-    "A learned law tells how often its quantity was in each of so many.",
+    "A learned law reports how often its quantity was in each of so many bins.",
     "judgement: as fine as a page shows",
 )
 SHOWN_PLACES = setting(
@@ -692,7 +692,7 @@ MOST_HYSTERESES = setting(
     2,
     "candidates",
     "So many hystereses are fitted to the end, whatever data left out say.",
-    "judgement: what promises most tells crank and rings hardly apart",
+    "judgement: what promises most hardly distinguishes crank and rings",
 )
 MOST_OVER_TIME = setting(
     2,
@@ -745,13 +745,13 @@ FINE_SPLINES = setting(
 FORMULA_MAY_EARN = setting(
     0.25,
     "log error",
-    "A curve within this of the best that does not earn its place may do so by a formula.",
+    "A curve within this of the best that is not accepted may be accepted by its closed form.",
     "judgement: a formula has fewer parameters",
 )
 NOT_INSTEAD = setting(
     0.5,
     "log error",
-    "What harms no validation log is not taken instead of what does where it is worse than the best by this.",
+    "What degrades no validation log does not replace what does where it is worse than the best by this.",
     "judgement: ten times RIVAL",
 )
 LEAST_PARAMETER_LEFT = setting(
@@ -782,13 +782,16 @@ LAG_PLACES = setting(
     "principle: centres of three equal parts",
 )
 SHORTEST_LAG = setting(
-    3.0, "samples", "The shortest lag tried is so many long.", "principle: a shorter one is not told from none"
+    3.0,
+    "samples",
+    "The shortest lag tried is so many long.",
+    "principle: a shorter one cannot be distinguished from none",
 )
 LONGEST_LAG = setting(
     0.125,
     "log lengths",
     "The longest lag tried is this part of the shortest log.",
-    "principle: a longer one is not told from an integral",
+    "principle: a longer one cannot be distinguished from an integral",
 )
 MOST_DIFFERENCES = setting(
     2,
@@ -861,7 +864,10 @@ ABOUT_LINES = setting(
     "judgement: enough for a median, near enough for coloured noise",
 )
 LEAST_CYCLES = setting(
-    6.0, "cycles", "A log must contain at least so many of a period.", "principle: fewer are not told from drift"
+    6.0,
+    "cycles",
+    "A log must contain at least so many of a period.",
+    "principle: fewer cannot be distinguished from drift",
 )
 SAMPLES_PER_PERIOD = setting(
     2.5, "samples", "A period must have at least so many.", "principle: two are the sampling theorem's limit"
@@ -914,7 +920,7 @@ MOSTLY = setting(
 LINE_RESOLVED = setting(
     0.5,
     "lines",
-    "Two frequencies that are nearer than this are not told apart.",
+    "Two frequencies that are nearer than this are not distinguished.",
     "principle: resolution of a spectrum of that length",
 )
 LINES_EACH = setting(
@@ -932,7 +938,7 @@ LINE_DERIVATIVES = setting(
 UNEVEN_PERIODS = setting(
     0.5,
     "periods",
-    "A channel must leave a straight course in time by this for a period along it to be told from one in time.",
+    "A channel must leave a straight course in time by this, so that a period along it is not one in time.",
     "principle: half a period is the largest difference of phase",
 )
 CYCLE_BINS = setting(
@@ -1090,10 +1096,13 @@ DRIVES = setting(
     -0.05,
     "RMS powers",
     "A measured force drives a machine where its mean power is below this, in RMS force times RMS velocity.",
-    "principle: what is driven takes some; the sign is told beyond noise",
+    "principle: what is driven takes some; the sign stands out from noise",
 )
 MOVES = setting(
-    0.3, "RMS", "A velocity at the start of a log is told where it exceeds this.", "judgement: a third of what is usual"
+    0.3,
+    "RMS",
+    "A velocity at the start of a log is reported where it exceeds this.",
+    "judgement: a third of what is usual",
 )
 EDGE_PERIODS = setting(
     2.0,
@@ -1222,10 +1231,10 @@ SIMPLER = setting(
     {"hydraulic": 4e-4, "electromechanical": 1.1e-3},
     "mm",
     "The simpler model of an actuator leaves this of one with mass, oil spring and bristles.",
-    "benchmark: logs of the rig without noise leave 0.0004 (hydraulic), 0.0008 to 0.0015 (electromechanical)",
+    "benchmark: simulated logs without noise leave 0.0004 (hydraulic), 0.0008 to 0.0015 (electromechanical)",
 )
 QUICK_SAMPLES = setting(
-    4_000, "samples", "The excerpt that tells which candidates to fit has so many.", "budget of work: ranking only"
+    4_000, "samples", "The excerpt that ranks the candidates to fit has so many.", "budget of work: ranking only"
 )
 LEARN_PIECE = setting(
     1_000,
@@ -1246,7 +1255,10 @@ PROBED = setting(
     "numerics: between rounding and curvature",
 )
 LAG_CHANGES = setting(
-    0.01, "spreads", "A lag must change a channel by this part of its spread.", "judgement: less is not told from none"
+    0.01,
+    "spreads",
+    "A lag must change a channel by this part of its spread.",
+    "judgement: less cannot be distinguished from none",
 )
 CHAIN_MEMORY = setting(
     10.0, "s", "No subsystem of the vane chain remembers longer than this.", "physics: longer than its slowest lag"
@@ -1255,7 +1267,7 @@ LEAST_FLOOR = setting(
     {"demand": 2e-3, "servo": 1e-3, "engine": 1e-4, "actuator": 1e-4, "linkage": 1e-3},
     "border units",
     "The noise floor of a subsystem is at least this.",
-    "physics: nobody measures finer",
+    "physics: no sensor measures finer",
 )
 CURRENT_DRAWS = setting(
     8,
@@ -1276,7 +1288,10 @@ TRIANGLE_ROWS = setting(
     4_000, "rows", "One triangle of the feedback is made of so many at a time.", "budget of work: memory"
 )
 SMOOTH_WINDOW = setting(
-    1.0, "s", "What smoothing bends is told from noise over this time.", "judgement: longer than a step of the servo"
+    1.0,
+    "s",
+    "What smoothing bends is distinguished from noise over this time.",
+    "judgement: longer than a step of the servo",
 )
 CURRENT_LAGS = setting(
     (0.01, 0.03, 0.1),
@@ -1309,7 +1324,7 @@ MOST_REPEATS = setting(
     4,
     "repeats",
     "A profile is proposed with at most so many, where once does not decide.",
-    "judgement: minutes at a rig",
+    "judgement: minutes at a test bench",
 )
 MARGIN = setting(
     2.0,
@@ -1341,7 +1356,7 @@ EFFECT_FACTORS = setting(
     "The screening tries an effect that multiplies at these factors.",
     "judgement: from hardly seen to gross",
 )
-RASTER = setting(1e-2, "s", "Logs are resampled to this raster.", "physics: period of the controller's slow frames")
+RASTER = setting(1e-2, "s", "Logs are resampled to this time base.", "physics: period of the controller's slow frames")
 WINDOW = setting(
     1.0,
     "s",
@@ -1350,7 +1365,10 @@ WINDOW = setting(
 )
 SUBSTEPS = setting(5, "steps", "The actuator makes so many between two samples.", "numerics: steps of 2 ms")
 SETTLE = setting(
-    3.0, "s", "So much at the start of a log does not count.", "physics: filters, lags and play forget how they started"
+    3.0,
+    "s",
+    "So much at the start of a log does not count.",
+    "physics: filters, lags and backlash forget how they started",
 )
 
 # A name that stands twice would leave more settings than names: the record cannot be made then.
