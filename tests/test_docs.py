@@ -112,6 +112,8 @@ NOT_RUN: dict[str, str] = {
     "python -m benchmarks.fleet_demo": "simulates the logs of many engines; tests/test_fleet_report.py",
     "python -m benchmarks.hidden_effect": "draws and diagnoses logs for an hour; tests/test_hidden_effect.py",
     "python -m benchmarks.hidden_law": "draws and diagnoses systems for an hour; tests/test_hidden_law.py",
+    "python -m benchmarks.gpu": "measures on an NVIDIA GPU; tests/test_gpu.py",
+    "python -m benchmarks.settings": "overwrites docs/settings.md; tests/test_settings.py compares it",
     "vaneloop campaign": "runs for minutes, on workers; tests/test_campaign.py",
     "vaneloop web": "serves until Ctrl-C; tests/test_web.py",
     "make mutants": "changes the code under test for many minutes; tests/test_mutants.py runs small campaigns",

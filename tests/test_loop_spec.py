@@ -662,10 +662,10 @@ def test_effects_on_the_calibration_are_flashed() -> None:
 
 def test_what_is_one_for_all_or_one_for_each() -> None:
     one = Stimulus.of(60.0)
-    assert lanes._for_each(one, Stimulus, 3, "stimulus") == [one] * 3
-    assert lanes._for_each((one, one), Stimulus, 2, "stimulus") == [one, one]
+    assert lanes.for_each(one, Stimulus, 3, "stimulus") == [one] * 3
+    assert lanes.for_each((one, one), Stimulus, 2, "stimulus") == [one, one]
     with pytest.raises(ValueError, match=r"stimulus \(=1 of them\) must be one, or one for each of the 2 plants"):
-        lanes._for_each([one], Stimulus, 2, "stimulus")
+        lanes.for_each([one], Stimulus, 2, "stimulus")
 
 
 def test_a_block_begins_with_a_line_of_the_cache() -> None:

@@ -355,14 +355,14 @@ def test_a_history_grows_and_older_files_are_read() -> None:
 
 @pytest.mark.parametrize("given, says", [
     ({"parameters": {"actuator.flow_gian": 1.0}}, "parameters: 'actuator.flow_gian' is unknown, probably 'actuator"),
-    ({"parameters": {"linkage.vgv5_play": 1.0}}, r"parameters: .* is of a stage that this machine lacks \(vgv5\)"),
+    ({"parameters": {"linkage.vgv5_play": 1.0}}, r"parameters: .* is of a vane row that this machine lacks \(vgv5\)"),
     ({"effects": {"valve_dead_bend": {}}}, "effects: 'valve_dead_bend' is unknown, probably 'valve_dead_band'"),
     ({"effects": {"gear_backlash": {}}}, "effects: 'gear_backlash' is of an actuator of kind electromechanical; this"),
     ({"effects": {"valve_dead_band": {"halfwidth": 1.0}}}, "effects.valve_dead_band: 'halfwidth' is unknown, probably"),
-    ({"effects": {"linkage_backlash": {"vgv6": 0.1}}}, "effects.linkage_backlash: 'vgv6' is of a stage that this mach"),
+    ({"effects": {"linkage_backlash": {"vgv6": 0.1}}}, "effects.linkage_backlash: 'vgv6' is of a vane row that this"),
     ({"curves": {f"c{k}": law() for k in range(5)}}, r"curves \(=5\) must be at most 4"),
     ({"curves": {"c": law(at="nowhere")}}, r"curves.c: at, how \(='nowhere', 'adds'\) is unknown; allowed: contr"),
-    ({"curves": {"c": law(at="sensors.vgv6")}}, "curves.c: at, how .* is of a stage that this machine lacks"),
+    ({"curves": {"c": law(at="sensors.vgv6")}}, "curves.c: at, how .* is of a vane row that this machine lacks"),
     ({"curves": {"c": law(of="vgv6")}}, r"curves.c: of \(='vgv6'\) is unknown; allowed: i_cmd, "),
     ({"curves": {"c": law(of="what_lagged_by_2_s")}}, r"curves.c: of \(='what_lagged_by_2_s'\) is unknown"),
     ({"curves": {"c": law(of="stops_of_time")}}, r"curves.c: of \(='stops_of_time'\) is unknown"),

@@ -241,7 +241,7 @@ def test_every_command_refuses_a_wrong_unit_with_the_same_line(
 
 
 def test_the_workbench_refuses_it_with_the_same_line(tmp_path: Path) -> None:
-    from vaneloop.web import worker
+    from vaneloop.web import process, worker
 
     file = tmp_path / "rpm.csv"
     write_log(file, as_if(a_run(8.0), n_dem=lambda v: v * 300))
@@ -252,7 +252,7 @@ def test_the_workbench_refuses_it_with_the_same_line(tmp_path: Path) -> None:
     for task in tasks:
         with pytest.raises(LogError) as again:
             task(silent, [str(file)])
-        assert str(again.value) == str(caught.value) == worker._line(again.value)
+        assert str(again.value) == str(caught.value) == process._line(again.value)
     with pytest.raises(LogError, match="n_dem"):
         worker.schedule_step(silent, "loop", ["--log", str(file)], str(tmp_path), "")
     words = ["--log", str(file), "--unit", "n_dem=rpm", "--design-rpm", "30000"]

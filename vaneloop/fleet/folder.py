@@ -64,7 +64,8 @@ _ROOT = Path(__file__).parents[2]
 LEFT_BEHIND = 3600.0  # s since it was last written to, after which nobody is at work on a temporary file
 # what a result follows from: how it is found and written, and the tables of a machine that nobody gave
 _SOURCES = (
-    "controller", "plant", "hil", "vaneloop/base", "vaneloop/identification", "vaneloop/verbs", "vaneloop/fleet"
+    "controller", "plant", "hil",
+    *(f"vaneloop/{room}" for room in ("base", "identification", "pages", "verbs", "fleet")),
 )  # fmt: skip
 
 
