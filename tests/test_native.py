@@ -304,6 +304,22 @@ def test_what_goes_wrong_ends_its_own_process_and_says_how(gcc: str, tmp_path: P
     assert "in tick 500, 0.500 s after power-on; last inputs: n_dem 80 %" in text
 
 
+def test_a_controller_that_exits_waits_for_no_library(gcc: str, tmp_path: Path) -> None:
+    calibration = with_program(wrong(gcc, tmp_path, "exit(3);"))
+    child = os.fork()
+    if child == 0:  # a process in which a library waits for ever when it ends
+        code = 1
+        try:
+            libc = ctypes.CDLL(None)
+            getattr(libc, "__cxa_atexit")(libc.pause, None, None)
+            with pytest.raises(ControllerFailed, match="ended with code 3"):
+                isolated(lambda: in_lockstep(calibration), patience=5.0)
+            code = 0
+        finally:
+            os._exit(code)
+    assert os.waitpid(child, 0)[1] == 0
+
+
 def test_a_current_at_its_limit_in_single_precision_is_good(gcc: str, tmp_path: Path) -> None:
     path = wrong(gcc, tmp_path, "out->i_cmd = (double)0.04f;")
     assert isolated(lambda: in_lockstep(with_program(path))) == 10.0

@@ -312,6 +312,15 @@ def _is_ours(process: int) -> bool:
 # ---- the process with the controller ---------------------------------------------------------------------------------
 
 
+def _end_at_once() -> None:
+    """Let ``exit`` of C end this process without what libraries registered for its end: after a fork they may wait for
+    threads or locks that are not there.
+    """
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "on_exit"):  # GNU's; what was registered last is called first, with the exit code
+        libc.on_exit(libc._exit, None)
+
+
 def _run(task: Callable[[], Any], folder: Path, every_tick: bool, mask: set[Any]) -> NoReturn:
     """Be the process with the controller."""
     code = 1
@@ -321,6 +330,7 @@ def _run(task: Callable[[], Any], folder: Path, every_tick: bool, mask: set[Any]
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        _end_at_once()
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         faulthandler.disable()  # the caller says what happened, in one line
         with contextlib.suppress(OSError):  # where memory runs out, it is this process that the kernel ends
