@@ -212,7 +212,7 @@ def test_the_command_prints_judges_and_writes(tmp_path, capsys) -> None:
     page, answer = tmp_path / "s.html", tmp_path / "s.json"
     assert main(["strategies", "--dwell", "0.1", "--report", str(page), "--json", str(answer)]) == 0
     out = capsys.readouterr().out
-    assert "all together" in out and "goals held" in out
+    assert "all together" in out and "goals met" in out
     j = json.loads(answer.read_text(encoding="utf-8"))
     assert (
         j["schema"] == 1 and j["best"] == "adaptive" and len(j["rows"]) == 24 and len(j["failures"]) == len(st.FAILURES)
