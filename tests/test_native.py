@@ -408,8 +408,10 @@ HANGS = {
         {"fault": "kill(getppid(), SIGSTOP); for (;;) sink += 1.0;"}, r"did not come back within 0\.5 s, in tick 500"
     ),
     "a copy beside it": ({"fault": "if (!times++) fork(); for (;;) sink += 1.0;"}, r"within 0\.5 s, in tick 500"),
-    "its end": ({"top": "__attribute__((destructor)) static void end(void) { for (;;) sink += 1.0; }",
-                 "fault": "exit(0);"}, r"within 0\.5 s, in tick 500"),
+    "its end": ({"top": "static void end(void) { for (;;) sink += 1.0; }", "fault": "atexit(end); exit(0);"},
+                r"within 0\.5 s, in tick 500"),
+    "its library's end": ({"top": "__attribute__((destructor)) static void end(void) { for (;;) sink += 1.0; }",
+                           "fault": "exit(0);"}, "ended with code 0, in tick 500"),
     "its beginning": ({"top": "__attribute__((constructor)) static void begin(void) { for (;;) sink += 1.0; }"},
                       r"within 0\.5 s, in the loading of its library, while it was switched on"),
     "its black box": (
