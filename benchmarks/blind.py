@@ -18,19 +18,50 @@ from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import whole
 
-__all__ = ["INSIDE", "KINDS", "add_kinds", "as_curve", "print_shares", "read_rows", "run", "share", "write_rows"]
+__all__ = [
+    "INSIDE",
+    "KINDS",
+    "add_learn_options",
+    "add_run_options",
+    "as_curve",
+    "print_shares",
+    "read_rows",
+    "run",
+    "share",
+    "write_rows",
+]
 
 Row = dict[str, Any]
 KINDS = ("clean", "outside", "pair", "single")  # of what is hidden; outside: what the library does not have
 INSIDE = 0.90  # of the visited values: there the truth must be in the band of a curve that is the law
 
 
-def add_kinds(parser: argparse.ArgumentParser, what: str) -> None:
-    """Declare ``--kinds`` of ``what``."""
+def add_learn_options(parser: argparse.ArgumentParser, laws: str) -> None:
+    """Declare what is learned; ``laws``: what can be left out of the library."""
+    parser.add_argument(
+        "--learn", action="store_true", help="ask vaneloop learn, too: is the law that nobody listed found?"
+    )
+    parser.add_argument(
+        "--leave-out",
+        action="store_true",
+        help=f"hide only {laws} of the library that are functions of one quantity, each taken out of the library: does "
+        "vaneloop learn find it?",
+    )
+
+
+def add_run_options(parser: argparse.ArgumentParser, what: str, one: str, out: str) -> None:
+    """Declare which of ``what`` (``one`` of them) are drawn, by how many workers, and the file of the results."""
     parser.add_argument(
         "--kinds", nargs="+", choices=KINDS, default=list(KINDS), metavar="KIND",
         help=f"draw only {what} of these kinds: {', '.join(KINDS)} (default: all)",
     )  # fmt: skip
+    parser.add_argument(
+        "--workers", type=int, default=2, metavar="N", help=f"{what} diagnosed side by side (default 2)"
+    )
+    parser.add_argument(
+        "--out", metavar="F.parquet", default=out, help=f"results, a row a {one}; an existing file is continued"
+    )
+    terminal.add_output_options(parser)
 
 
 def run(

@@ -19,7 +19,17 @@ from typing import Any
 import numpy as np
 
 from benchmarks import start
-from benchmarks.blind import INSIDE, KINDS, add_kinds, as_curve, print_shares, read_rows, run, share
+from benchmarks.blind import (
+    INSIDE,
+    KINDS,
+    add_learn_options,
+    add_run_options,
+    as_curve,
+    print_shares,
+    read_rows,
+    run,
+    share,
+)
 from benchmarks.same_curve import as_a_curve
 from hil.logs import Channel, read_log, write_log
 from hil.loop.lockstep import warm_up
@@ -82,24 +92,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="plant's table of the machine, one of the two that the rig has: plant.toml (default) or "
         "plant_electromechanical.toml",
     )
-    parser.add_argument(
-        "--learn", action="store_true", help="ask vaneloop learn, too: is the law that nobody listed found?"
-    )
-    parser.add_argument(
-        "--leave-out",
-        action="store_true",
-        help="hide only effects of the library that are functions of one quantity, each taken out of the library: does "
-        "vaneloop learn find it?",
-    )
-    add_kinds(parser, "logs")
-    parser.add_argument("--workers", type=int, default=2, metavar="N", help="logs diagnosed side by side (default 2)")
-    parser.add_argument(
-        "--out",
-        metavar="F.parquet",
-        default="out/hidden_effect.parquet",
-        help="results, a row a log; an existing file is continued",
-    )
-    terminal.add_output_options(parser)
+    add_learn_options(parser, "effects")
+    add_run_options(parser, "logs", "log", "out/hidden_effect.parquet")
 
 
 def draw_case(

@@ -18,7 +18,17 @@ from typing import Any
 import numpy as np
 
 from benchmarks import start
-from benchmarks.blind import INSIDE, KINDS, add_kinds, as_curve, print_shares, read_rows, run, share
+from benchmarks.blind import (
+    INSIDE,
+    KINDS,
+    add_learn_options,
+    add_run_options,
+    as_curve,
+    print_shares,
+    read_rows,
+    run,
+    share,
+)
 from benchmarks.same_law import same_by_equations
 from tests import rig_systems as rig
 from tests.nominal_systems import nominal
@@ -67,32 +77,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="diagnose each system again with its time and channels scaled, a sign flipped, everything reordered, "
         "other starts, logs cut in two: is the answer the same?",
     )
-    parser.add_argument(
-        "--learn", action="store_true", help="ask vaneloop learn, too: is the law that nobody listed found?"
-    )
-    parser.add_argument(
-        "--leave-out",
-        action="store_true",
-        help="hide only laws of the library that are functions of one quantity, each taken out of the library: does "
-        "vaneloop learn find it?",
-    )
+    add_learn_options(parser, "laws")
     parser.add_argument(
         "--surface",
         action="store_true",
         help="hide a law of two quantities in every other system, and in the others nothing, or a law of one: does "
         "vaneloop learn find both quantities, and no surface where there is none?",
     )
-    add_kinds(parser, "systems")
-    parser.add_argument(
-        "--workers", type=int, default=2, metavar="N", help="systems diagnosed side by side (default 2)"
-    )
-    parser.add_argument(
-        "--out",
-        metavar="F.parquet",
-        default="out/hidden_law.parquet",
-        help="results, a row a system; an existing file is continued",
-    )
-    terminal.add_output_options(parser)
+    add_run_options(parser, "systems", "system", "out/hidden_law.parquet")
 
 
 def _said(

@@ -47,7 +47,6 @@ _ORDER = {"lt": "<", "gt": ">", "le": "<=", "ge": ">="}
 _OPPOSITE = {"lt": ">=", "gt": "<=", "le": ">", "ge": "<"}
 _FLAGS = re.compile(r"\b(nuw|nsw|exact|disjoint|nneg|samesign|inbounds|tail|musttail|notail|volatile)\b ")
 _NAME = r'(?:"[^"]*"|[\w.$-]+)'
-_VALUE = rf"%{_NAME}|@{_NAME}|[-+\w.]+"
 _MATHS = {"fabs", "floor", "ceil", "trunc", "rint", "sqrt", "sin", "cos", "tan", "exp", "log", "pow", "copysign"}
 _MATHS |= {
     "atan2",

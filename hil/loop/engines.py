@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from controller import Calibration, load_calibration, new_state
+from controller import Calibration, new_state
 from controller.records import DUAL, MODES, SCALAR_FIELDS, STATE, kind
 from hil.loop import cuda as gpu
-from hil.loop.lanes import for_each, lockstep_lanes
+from hil.loop.lanes import lockstep_lanes, loops_of
 from hil.loop.lockstep import CHUNK, S_N_DEM, S_N_R, S_T_OIL, WARM_UP, Run, Stimulus
-from hil.loop.tick import CHANGED_BY, FRAME, flashed, mean_stroke
+from hil.loop.tick import CHANGED_BY, flashed, mean_stroke
 from plant import Plant, chain, places
 from plant.effects import CURVES
 from plant.parameters import KIND
@@ -107,14 +107,7 @@ def lockstep_engines(
     """
     if device not in DEVICES:
         raise InputError(f"device (={device!r}) must be one of {', '.join(DEVICES)}")
-    if CHUNK % every:
-        raise ValueError(f"every (={every}) must divide {CHUNK}")
-    stimuli = for_each(stimulus, Stimulus, len(plants), "stimulus")
-    cals = for_each(calibrations or load_calibration(), Calibration, len(plants), "calibrations")
-    lengths = {len(s.rows) for s in stimuli}
-    if len(lengths) > 1:
-        raise ValueError(f"stimuli (={sorted(lengths)} rows) must be equally long")
-    ticks = int(round((duration if duration is not None else max(lengths, default=0) * FRAME) * 1000))
+    stimuli, cals, ticks = loops_of(stimulus, calibrations, len(plants), every, duration)
     work = _Work(stimuli, plants, cals, seed, every, ticks)
     out = work.out
     started = time.perf_counter()

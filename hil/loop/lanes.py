@@ -44,7 +44,7 @@ from plant.stages.blocks import on_all_cores
 from vaneloop.base.compiled import compiled, in_place_free
 from vaneloop.base.vanes import VANES
 
-__all__ = ["Lanes", "for_each", "lockstep_lanes"]
+__all__ = ["Lanes", "for_each", "lockstep_lanes", "loops_of"]
 
 EIGHT = 8  # lanes of a vector: a block runs a multiple of it
 LINE = 64  # bytes of a line of the cache
@@ -144,13 +144,7 @@ def lockstep_lanes(
     A run is that of `hil.loop.lockstep.lockstep` to rounding. It has no state hash, and its ``wall_s`` is its share of
     the wall clock. Raises ValueError where there is not one stimulus or calibration for each plant.
     """
-    if CHUNK % every:
-        raise ValueError(f"every (={every}) must divide {CHUNK}")
-    stimuli = for_each(stimulus, Stimulus, len(plants), "stimulus")
-    lengths = {len(s.rows) for s in stimuli}
-    if len(lengths) > 1:
-        raise ValueError(f"stimuli (={sorted(lengths)} rows) must be equally long")
-    cals = for_each(calibrations or load_calibration(), Calibration, len(plants), "calibrations")
+    stimuli, cals, ticks = loops_of(stimulus, calibrations, len(plants), every, duration)
     blocks: dict[Any, list[int]] = {}  # loops that can stand in one block
     loops: dict[int, Loop] = {}
     alone: list[int] = []
@@ -164,7 +158,6 @@ def lockstep_lanes(
     runs: dict[int, Run] = {}
     started = time.perf_counter()
     work = [(key[0], of[a : a + W]) for key, of in blocks.items() for a in range(0, len(of), W)]
-    ticks = int(round((duration if duration is not None else max(lengths, default=0) * FRAME) * 1000))
 
     def run(part: range) -> None:
         for way, some in work[part.start : part.stop]:
@@ -180,6 +173,24 @@ def lockstep_lanes(
             stimuli[i], calibration=cals[i], plant=plants[i], seed=seed, every=every, duration=duration, hashed=False
         )
     return [runs[i] for i in range(len(plants))]
+
+
+def loops_of(
+    stimulus: Stimulus | Sequence[Stimulus],
+    calibrations: Calibration | Sequence[Calibration] | None,
+    count: int,
+    every: int,
+    duration: float | None,
+) -> tuple[list[Stimulus], list[Calibration], int]:
+    """Stimulus and calibration of each of ``count`` loops, and their ticks, checked as `lockstep_lanes` says."""
+    if CHUNK % every:
+        raise ValueError(f"every (={every}) must divide {CHUNK}")
+    stimuli = for_each(stimulus, Stimulus, count, "stimulus")
+    lengths = {len(s.rows) for s in stimuli}
+    if len(lengths) > 1:
+        raise ValueError(f"stimuli (={sorted(lengths)} rows) must be equally long")
+    ticks = int(round((duration if duration is not None else max(lengths, default=0) * FRAME) * 1000))
+    return stimuli, for_each(calibrations or load_calibration(), Calibration, count, "calibrations"), ticks
 
 
 def for_each(one_or_many: Any, kind: type, count: int, name: str) -> list[Any]:

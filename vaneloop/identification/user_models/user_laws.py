@@ -27,7 +27,6 @@ __all__ = ["FIRST_CODE", "Law", "check_parameters", "is_name"]
 
 MOST_PARAMETERS, MOST_MEMORY = 8, 64
 FIRST_CODE = {"signal": 101, "force": 201, "state": 301}  # numbers in the compiled dispatch; the library's are below
-PLACES_OF = {"signal": ("input", "output"), "force": ("force",), "state": ("state",)}
 
 
 @dataclass(frozen=True)
