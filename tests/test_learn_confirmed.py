@@ -160,13 +160,13 @@ def test_a_friction_is_tried_with_its_jump_though_its_splines_leave_more_than_an
         pass
 
     finalists: list[Any] = []
-    found = CurveSearch._finalists
+    found = CurveSearch.finalists
 
     def first(self: CurveSearch, current: Any) -> Any:
         finalists.extend(found(self, current))
         raise Enough
 
-    monkeypatch.setattr(CurveSearch, "_finalists", first)
+    monkeypatch.setattr(CurveSearch, "finalists", first)
     t, rng = np.arange(0.0, 16.0, 0.01), np.random.default_rng(3)
     phases = zip((0.3, 0.7, 1.1, 1.7), rng.uniform(0.0, 6.0, 4), strict=True)
     x = np.sum([np.sin(2.0 * np.pi * f * t + phase) / f for f, phase in phases], axis=0)

@@ -8,14 +8,27 @@ import numpy as np
 import pytest
 
 from tests.test_learn_vanes import chain
-from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.selection.relative_error_acceptance import score
+from vaneloop.identification.selection.rules import EXCESS, GAIN, NEAR_NOISE, AllRows, Comparison
 from vaneloop.identification.settings import FORMS_ALIKE, FORMS_REFITTED, NATS, PER_PARAMETER, RIVAL, RIVAL_NATS
+from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import _nearest
-from vaneloop.identification.unmodelled.likelihood_acceptance import above_the_noise, earns, grain_of, unconfirmed
+from vaneloop.identification.unmodelled.likelihood_acceptance import above_the_noise, grain_of
 from vaneloop.identification.vane_chain.candidates import VaneChainCandidates, remade
 
 N = 30_000
+
+
+def accepted(judge: LeastSquaresProblem, before: Fit, after: Fit, correlation: float) -> bool:
+    case = Comparison(judge, before, after, correlation)
+    return all(rule.verdict(case).holds for rule in (EXCESS, GAIN))
+
+
+def unconfirmed(before: dict[str, Array], after: dict[str, Array], tests: frozenset[str]) -> str:
+    case = AllRows(before, after, tests)
+    assert (case.objection() == "") == all(r.verdict(case).holds for r in NEAR_NOISE if r.applies(case))
+    return case.objection()
 
 
 def nominal(name: str = "linkage"):
@@ -39,10 +52,10 @@ def test_two_per_cent_of_the_noise_earn_a_curve_its_place_and_chance_does_not() 
     after = replace(fit, held_out=fit.held_out * judge.n / fit.held_out.sum())
     before = replace(after, held_out=after.held_out * 1.02**2)
     assert above_the_noise(judge, before) and not above_the_noise(judge, after)
-    assert earns(judge, before, after, 1.0)
-    assert not earns(judge, before, after, 1e3)  # errors that repeat themselves a thousand times say little
+    assert accepted(judge, before, after, 1.0)
+    assert not accepted(judge, before, after, 1e3)  # errors that repeat themselves a thousand times say little
     chance = replace(after, held_out=after.held_out * (1.0 + 2.0 * (NATS - 1.0) / judge.n))
-    assert not earns(judge, chance, after, 1.0)
+    assert not accepted(judge, chance, after, 1.0)
 
 
 @pytest.mark.parametrize(("rest", "why"), [(0.98, ""), (1.0, "rest of the log: log-likelihood gain of 0.0 only")])

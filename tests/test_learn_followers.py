@@ -87,6 +87,6 @@ def test_candidates_are_ranked_on_all_samples(names: tuple[str, ...]) -> None:
     """In half a minute the links' lengths make up for anything."""
     learner = learner_of("linkage_compliance", (("compliance", 6e-4),), 90.0, *names)
     assert len(learner.ground.stage((), (), True).t) < len(learner.judge.stage.t)
-    learner._finalists(FittedCandidate(learner.candidates[0], 0.0, learner.judge, learner.base, ()))
+    learner.finalists(FittedCandidate(learner.candidates[0], 0.0, learner.judge, learner.base, ()))
     assert {len(t.judge.stage.t) for t in learner.ranked[0]} == {len(learner.judge.stage.t)}
     assert learner.ranked[0][0].candidate.name == names[0]

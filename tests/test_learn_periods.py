@@ -272,9 +272,9 @@ def drifting():
         diagnoses.append(diagnose(*words, **options))
         return diagnoses[-1]
 
-    search = CurveSearch._finalists
+    search = CurveSearch.finalists
     with pytest.MonkeyPatch.context() as m:
-        m.setattr(CurveSearch, "_finalists", finalists)
+        m.setattr(CurveSearch, "finalists", finalists)
         m.setattr("vaneloop.verbs.learn.diagnose", diagnosed_once)
         return learned_where_the_gain_drifts(), *diagnoses, found
 
@@ -299,7 +299,7 @@ def test_a_second_law_that_harms_a_log_is_told_and_the_first_one_stands(drifting
         return "makes two worse" if current.curves else harmful(self, current, best)
 
     monkeypatch.setattr(CurveSearch, "harmful", second_harms)
-    monkeypatch.setattr(CurveSearch, "_finalists", lambda self, current: found[step_of(self, current)])
+    monkeypatch.setattr(CurveSearch, "finalists", lambda self, current: found[step_of(self, current)])
     monkeypatch.setattr("vaneloop.verbs.learn.diagnose", lambda *_, **__: diagnosis)
     answer = learned_where_the_gain_drifts()
     (first,) = answer.laws

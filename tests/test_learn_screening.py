@@ -73,7 +73,7 @@ def test_what_goes_with_one_over_a_parameter_is_among_what_is_fitted(outflow: tu
     assert len(set(names)) == len(names) >= CURVES_QUICK
     assert {(c.how, c.at) for _, c, _ in promising} == {(c.how, c.at) for c in learner.candidates}
     assert "outflow.gain_of_oil" in names
-    best = learner._finalists(current)[0]
+    best = learner.finalists(current)[0]
     assert best.candidate.name == "outflow.gain_of_oil" and leaves(best) < 1.1
 
 

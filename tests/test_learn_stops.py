@@ -203,7 +203,7 @@ def test_of_what_a_bushing_may_be_the_hysteresis_at_the_crank_is_best(monkeypatc
     d: Any = SimpleNamespace(base=fit, final=fit, verdict="unknown", effects=[], nearest=[])
     learner = CurveSearch(ground, d)
     before = FittedCandidate(learner.candidates[0], 0.0, learner.judge, learner.base, ())
-    best = learner._finalists(before)[0]
+    best = learner.finalists(before)[0]
     assert best.candidate.at == "linkage.crank"
     assert learner._earns(before, best) and another_confirms(learner, before, best)
     # its first spline is wider than the bushing's first play

@@ -8,7 +8,7 @@ from typing import Any
 
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
-from vaneloop.cli import options, own_model
+from vaneloop.cli import explain, options, own_model
 from vaneloop.cli.chains import chain_of
 from vaneloop.cli.options import add_machine_options
 from vaneloop.pages.story import CANNOT, doubt, word
@@ -25,6 +25,7 @@ library does not suffice the answer is "unknown", with the shape of the remainin
 
 examples:
   vaneloop diagnose examples/hidden_effect.parquet --report diagnosis.html
+  vaneloop diagnose examples/hidden_effect.parquet --explain
   vaneloop diagnose examples/hidden_effect.parquet --model with_dead_band.toml --json -
 
 exit codes: 0 nothing is missing, 1 something is missing or unknown, 2 bad input"""
@@ -39,6 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--workers", type=int, default=2, metavar="N", help="subsystems searched in parallel (default 2)"
     )
     options.add_without_option(parser)
+    explain.add_option(parser)
     own_model.add_options(parser)
     terminal.add_output_options(parser, report=True)
 
@@ -56,6 +58,7 @@ def command(args: argparse.Namespace) -> int:
         with options.search_bar(args) as news:
             answer = diagnosed(chain, args.log, args.workers, news=news)
     show(args, answer)
+    explain.show(args, {s.stage: (s.decisions, s.final.effects) for s in answer.diagnosis.stages})
     terminal.write_json(args, answer.to_dict())
     if args.report:
         words = " ".join(["vaneloop diagnose", *sys.argv[2:]])

@@ -9,7 +9,7 @@ from typing import Any
 from vaneloop.base import terminal
 from vaneloop.base.files import check
 from vaneloop.base.signals import heading
-from vaneloop.cli import options, own_model
+from vaneloop.cli import explain, options, own_model
 from vaneloop.cli.chains import chain_of
 from vaneloop.verbs.learn import checked_shape, learned, with_path
 from vaneloop.verbs.search import not_given
@@ -52,6 +52,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--curve", action="store_true",
         help="the law is the curve, even where a formula does as well",
     )  # fmt: skip
+    explain.add_option(parser)
     own_model.add_options(parser)
     terminal.add_output_options(parser, report=True)
     parser.set_defaults(learns=True)
@@ -88,6 +89,7 @@ def command(args: argparse.Namespace) -> int:
         terminal.say(args, f"note: {note}")
     if answer.outcome.nearest and not answer.laws:
         terminal.say(args, f"nearest: {', '.join(answer.outcome.nearest)}")
+    explain.show(args, answer.explained)
     terminal.say(args, answer.sentence())
     if answer.path:
         terminal.say(args, f"law: {answer.path}")

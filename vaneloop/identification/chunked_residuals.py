@@ -13,8 +13,8 @@ import numpy as np
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.regimes import stands_out
 from vaneloop.identification.results import StageDiagnosis
-from vaneloop.identification.selection.likelihood_acceptance import leaves_too_much
-from vaneloop.identification.settings import AGREES, EXPLAINED, FLOOR_KNOWN, NOISE_KNOWN_TO, PIECE_BLOCKS
+from vaneloop.identification.selection.rules import EXPLAINS_HALF, LEAVES_LITTLE, Decisions, Remainder
+from vaneloop.identification.settings import AGREES, NOISE_KNOWN_TO, PIECE_BLOCKS
 from vaneloop.identification.subsystem import Array, Stage
 
 __all__ = ["Failing", "Sums", "failing", "joined", "of_whole", "sums_of"]
@@ -164,14 +164,15 @@ def of_whole(d: StageDiagnosis, sums: Sums, fails: Sequence[Failing]) -> StageDi
     )
     if d.verdict == "unknown" or d.criterion != "noise_floor":
         return out
-    names, why = d.final.effects, ""
-    excess = before**2 - (1.0 + FLOOR_KNOWN) ** 2
+    names, why, decisions = d.final.effects, "", Decisions(d.decisions)
     worst, n = float(floors[1].max()), int(sums.samples.sum())
-    if names and before**2 - after**2 < EXPLAINED * excess:
-        share = max(before**2 - after**2, 0.0) / excess
+    left = Remainder(float(before), float(after), worst, len(names), n, d.correlation)
+    if not decisions.decide([EXPLAINS_HALF], left, names, ()):
+        share = max(left.explained, 0.0)
         why = f"over the whole log {' and '.join(names)} explains {share:.0%} of what exceeds the noise"
-    elif leaves_too_much(float(before), float(after), worst, len(names), n, d.correlation):
+    elif not decisions.decide(LEAVES_LITTLE, left, names, ()):
         why = f"leaves {after:.3g} noise floors over the whole log"
+    out.decisions = list(decisions)
     if fails and (why or not names):
         why = "; ".join(filter(None, [why, *map(str, fails)]))
     if not why:

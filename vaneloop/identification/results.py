@@ -9,6 +9,7 @@ import numpy as np
 
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.selection.calibration import trust
+from vaneloop.identification.selection.rules import Decision
 from vaneloop.identification.subsystem import Array, Stage
 
 __all__ = [
@@ -44,7 +45,7 @@ class Found:
     fall         error without it over the error with it
     evidence     what the probability follows from
     inseparable  what this log cannot tell from what the effect turns on ("time", "oil temperature")
-    refused      why it comes nearest and yet is no answer; "": it is one
+    other_cause  the cause with which its law is significantly better, so that it is no answer; "": none is
     """
 
     effect: str
@@ -58,7 +59,7 @@ class Found:
     evidence: dict[str, float] = field(default_factory=dict)
     probabilities: dict[str, float] = field(default_factory=dict)
     inseparable: list[str] = field(default_factory=list)
-    refused: str = ""
+    other_cause: str = ""
 
 
 @dataclass(eq=False)
@@ -85,6 +86,7 @@ class StageDiagnosis:
     gain: str = "log-likelihood gain on held-out data"  # what `Candidate.nats` counts
     criterion: str = ""  # what an effect had to do to be named: `identification.selection.calibration.COEFFICIENTS`
     notes: list[str] = field(default_factory=list)  # what decided between rivals, what was left out, in words
+    decisions: list[Decision] = field(default_factory=list, repr=False)  # every acceptance rule's verdict
 
 
 def rms_of(judge: LeastSquaresProblem, fit: Fit) -> float:

@@ -326,6 +326,9 @@ LEAST_HELP = setting(
 AGREE = setting(
     0.05, "log mean square", "Two blocks at least must improve by this.", "judgement: 5 % of the mean square"
 )
+AGREEING_BLOCKS = setting(
+    2.0, "blocks", "So many blocks must improve.", "principle: one block alone may hold a disturbance"
+)
 FLAT = setting(
     0.1,
     "share",

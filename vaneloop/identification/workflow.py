@@ -22,6 +22,7 @@ from vaneloop.identification.selection.likelihood_acceptance import (
     correlation_of,
     significant,
 )
+from vaneloop.identification.selection.rules import decisions_json
 from vaneloop.identification.settings import LOOK_EVERY, NATS, SHORT_SEARCH, SIZES_AGREE, USUAL_FITS
 from vaneloop.identification.subsystem import Stage, StageError
 
@@ -381,5 +382,6 @@ def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
         "unknown": unknown,
         "not_observable": unobservable,
         "notes": d.notes,
+        "decisions": [one for s in d.stages for one in decisions_json(s.decisions, stage=s.stage)],
         "elapsed_s": d.elapsed_s,
     }

@@ -16,6 +16,7 @@ from vaneloop.identification.subsystem import Bound, Stage
 from vaneloop.identification.user_models.by_log import ByLog
 from vaneloop.identification.workflow import Diagnosis
 from vaneloop.pages.by_log import curves_by_log, log_by_log
+from vaneloop.pages.decisions import explain
 from vaneloop.pages.failures import failure_map, worst_cell
 from vaneloop.pages.figures import UNDER, Line, Panel, loop, overlay, ranking, waterfall
 from vaneloop.pages.page import Page
@@ -302,6 +303,7 @@ def _told(
             "These effects would have left no trace here, however large: their absence is not shown.",
         )
         page.table(["effect", "subsystem", "what would excite it"], unseen)
+    explain(page, {s.stage: (s.decisions, s.final.effects) for s in d.stages})
     page.notes(d.notes)
     return page
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from vaneloop.identification.unmodelled.learned_law import LearnedLaw
 from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
 from vaneloop.identification.user_models.by_log import ByLog
 from vaneloop.pages.by_log import curves_by_log, log_by_log
+from vaneloop.pages.decisions import Explained, explain
 from vaneloop.pages.figures import Figure, Line, bars, loop
 from vaneloop.pages.page import Page
 from vaneloop.pages.story import floors
@@ -87,8 +88,9 @@ def learned_page(
     by_log: ByLog | None = None,
     command: str = "",
     log: str = "",
+    decisions: Mapping[str, Explained] | None = None,
 ) -> Page:
-    """The page of ``vaneloop learn``; ``said``: the answer in one sentence."""
+    """The page of ``vaneloop learn``; ``said``: the answer in one sentence; ``decisions``: as `explain` has it."""
     title = f"A law learned from {Path(log).name}" if laws else f"Learning from {Path(log).name}"
     page = Page(title, said, tone=TONES[outcome.verdict], command=command, log=log)
     for law in laws:
@@ -113,5 +115,6 @@ def learned_page(
     if by_log is not None:
         log_by_log(page, by_log)
         curves_by_log(page, by_log)
+    explain(page, decisions or {})
     page.notes(notes)
     return page

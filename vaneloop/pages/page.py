@@ -18,7 +18,8 @@ from __future__ import annotations
 import html
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -142,6 +143,15 @@ class Page:
             f'<div class="scroll"{_REGION.format("table")}>'
             f"<table>{note}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
         )
+
+    @contextmanager
+    def folded(self, summary: str) -> Iterator[None]:
+        """Fold what is added meanwhile under a line that opens it; plots cannot be folded."""
+        first = len(self.parts)
+        yield
+        inside = [part for part in self.parts[first:] if isinstance(part, str)]
+        body = "".join(inside)
+        self.parts[first:] = [f"<details><summary>{html.escape(summary)}</summary>{body}</details>"]
 
     def html(self) -> str:
         """Return the whole page."""

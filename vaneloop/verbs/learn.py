@@ -16,6 +16,7 @@ from vaneloop.base.files import write
 from vaneloop.identification import StageError, System
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import answer_of, found_of, recalibrated, rms_of
+from vaneloop.identification.selection.rules import decisions_json
 from vaneloop.identification.settings import HARM, LEAST_FALL, UNKNOWN
 from vaneloop.identification.unmodelled.curve_candidates import SHAPES, UserModelCandidates, on_logs
 from vaneloop.identification.unmodelled.fitted_candidate import Outcome
@@ -30,6 +31,7 @@ from vaneloop.identification.unmodelled.surface_candidates import SurfaceCandida
 from vaneloop.identification.unmodelled.surface_closed_forms import as_the_law, reach_of
 from vaneloop.identification.user_models.by_log import ByLog, as_given, bind
 from vaneloop.identification.vane_chain.candidates import VaneChainCandidates
+from vaneloop.pages.decisions import Explained
 from vaneloop.pages.learned import learned_page
 from vaneloop.pages.story import floors
 from vaneloop.pages.style import capital
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     from plant import Model
     from vaneloop.identification.least_squares.problem import Fit
     from vaneloop.identification.results import StageDiagnosis
+    from vaneloop.identification.selection.rules import Decision
     from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
     from vaneloop.identification.unmodelled.learned_law import LearnedLaw
     from vaneloop.identification.vane_chain.chain import Chain
@@ -59,6 +62,7 @@ class Learned(Answer):
     by_log     errors before and after, log by log, where one was
     model      the model with them, to be written; None: none was learned
     steps      channel -> step (border unit) in which its reading comes, where its converter's low bits are lost
+    decisions  subsystem -> what the acceptance rules said of each candidate
     """
 
     diagnosed: Diagnosed
@@ -69,6 +73,7 @@ class Learned(Answer):
     log: str = ""
     path: str = ""
     steps: Mapping[str, float] = field(default_factory=dict)
+    decisions: Mapping[str, Sequence[Decision]] = field(default_factory=dict, repr=False)
 
     @property
     def verdict(self) -> str:
@@ -97,8 +102,15 @@ class Learned(Answer):
             "laws": [law_json(law) for law in self.laws], "nearest": self.outcome.nearest, "model": self.path,
             "named": self.diagnosed.effects, "notes": self.notes,
         }  # fmt: skip
+        out["decisions"] = [one for name, of in self.decisions.items() for one in decisions_json(of, stage=name)]
         out |= {"steps": dict(self.steps)} if self.steps else {}
         return out | ({"logs": self.by_log.json()["logs"]} if self.by_log else {})
+
+    @property
+    def explained(self) -> dict[str, Explained]:
+        """Subsystem -> decisions, and the names of what was chosen."""
+        chosen = [law.name for law in self.laws]
+        return {name: (of, chosen) for name, of in self.decisions.items()}
 
     @property
     def notes(self) -> list[str]:
@@ -116,7 +128,8 @@ class Learned(Answer):
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
-        return learned_page(self.laws, self.outcome, self.sentence(), self.notes, self.by_log, command, self.log)
+        said, of = self.sentence(), self.explained
+        return learned_page(self.laws, self.outcome, said, self.notes, self.by_log, command, self.log, of)
 
     def write(self, path: str | Path) -> Path:
         """Write the model with its laws, a file that ``extend --effect`` and ``--model`` take; return its path."""
@@ -210,6 +223,7 @@ def learned(
     open_ones = [s for s in stages if _open(chain, s)]
     laws: list[LearnedLaw] = []
     model, said, out = before, [], None
+    decisions: dict[str, list[Decision]] = {}
     for i, d in enumerate(open_ones):
         stage = chain.stage(d.stage)
         if stage.coarse:  # what it would learn is how the steps look from there
@@ -222,6 +236,7 @@ def learned(
         said_by = lambda f, i=i: tell(begun + (1.0 - begun) * (i + f) / len(open_ones))  # noqa: E731
         learner = CurveSearch(ground, d, said_by, shape, formulas)
         one = learner.learned()
+        decisions[d.stage] = one.decisions
         out = out or (one if d.verdict == "unknown" else None)
         said += [f"{d.stage}: {note}" for note in one.notes]
         if one.verdict != "learned" and d.verdict == "none":  # little is above the noise, and no law says it
@@ -254,7 +269,7 @@ def learned(
         model = with_fits(model, [s for s in stages if s.verdict == "missing"])
     outcome = Outcome(verdict, nearest=out.nearest if out else [], why=why, notes=said if laws else [])
     tell(1.0)
-    return Learned(found, outcome, laws, None, model if laws else None, log, steps=chain.steps)
+    return Learned(found, outcome, laws, None, model if laws else None, log, steps=chain.steps, decisions=decisions)
 
 
 def _open(chain: Chain, d: StageDiagnosis) -> bool:
@@ -290,8 +305,9 @@ def _learned(
     ground = UserModelCandidates(logs)
     learner = CurveSearch(ground, diagnosed.diagnosis.stages[0], progress, shape, formulas)
     outcome = learner.learned()
+    decisions = {diagnosed.diagnosis.stages[0].stage: outcome.decisions}
     if outcome.verdict != "learned":
-        return Learned(diagnosed, outcome, [], log=diagnosed.log)
+        return Learned(diagnosed, outcome, [], log=diagnosed.log, decisions=decisions)
     laws, before = [], (learner.judge, learner.base)
     for tried in outcome.tried:
         surface = isinstance(tried.candidate, SurfaceCandidate)
@@ -317,7 +333,7 @@ def _learned(
     by_log = ByLog.of(on_logs(logs, last.curves), d, added)
     model = _as_model(by_log.model, outcome, laws, last)
     progress(1.0)
-    return Learned(diagnosed, outcome, laws, by_log, model, diagnosed.log)
+    return Learned(diagnosed, outcome, laws, by_log, model, diagnosed.log, decisions=decisions)
 
 
 def _beside_named(

@@ -8,7 +8,7 @@ will not.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -18,6 +18,7 @@ from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProbl
 from vaneloop.identification.results import Candidate, StageDiagnosis, answer_of, found_of, parameters_of, rms_of
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
 from vaneloop.identification.selection.search import Criterion, Search
+from vaneloop.identification.selection.stepwise import eliminate, stepwise
 from vaneloop.identification.selection.subsampled_search import excerpt_of, searched
 from vaneloop.identification.settings import EXCERPT_PIECE, EXCERPT_SAMPLES, LONG_SAMPLES, PAIR_LEADERS, TOLERATED
 from vaneloop.identification.subsystem import Array, Stage, StageError, noise_of, reach_of
@@ -93,14 +94,18 @@ def _confirm(
         if judge.total_of(current) > judge.total_of(nominal):  # what suits the excerpt may suit nothing else
             current = judge.fit(chosen, nominal.theta, 8)
     criterion.learn(current)
-    while chosen:
-        rest = [tuple(c for c in chosen if c != name) for name in chosen]
-        tasks = [judge.fitting(r, np.where(_allowed(stage, r), current.theta, stage.neutral()), 6) for r in rest if r]
-        without = judge.together(tasks) if rest[0] else [nominal]
-        idle = [k for k, f in enumerate(without) if not criterion.earns(f, current)]
-        if not idle:
-            break
-        chosen, current = rest[idle[0]], without[idle[0]]
+
+    def without(fit: Fit) -> list[Fit]:
+        rest = [tuple(c for c in fit.effects if c != name) for name in fit.effects]
+        begins = (np.where(_allowed(stage, r), fit.theta, stage.neutral()) for r in rest)
+        return (
+            [nominal]
+            if rest == [()]
+            else judge.together([judge.fitting(r, b, 6) for r, b in zip(rest, begins, strict=True)])
+        )
+
+    current = eliminate(current, without, criterion.earns, lambda idle: idle[0])
+    chosen = current.effects
     effects = [
         replace(f, parameters=parameters_of(stage, current, f.effect)) for f in said.effects if f.effect in chosen
     ]
@@ -174,50 +179,60 @@ def _search(search: Search) -> Said:
         candidates.append(Candidate(name, *criterion.gain(base, fit), why, rms_of(judge, fit)))
     candidates.sort(key=lambda c: -c.nats)
 
-    current, steps = base, [("nominal", rms_of(judge, base))]
-    tried = -1
+    steps = [("nominal", rms_of(judge, base))]
+    current, tried = base, -1
     while len(criterion.left_out) > tried:  # what was left out in the end may have stood in another's way
         tried = len(criterion.left_out)
-        current = _grown(search, current, singles, [c.effect for c in candidates], steps)
-        grown = current.effects
-        current = criterion.settle(search, search.pruned(current))
-        if current.effects and current.effects != grown:
-            steps.append((" + ".join(current.effects), rms_of(judge, current)))
+        current = stepwise(EffectSelection(search, singles, [c.effect for c in candidates], steps), current)[-1]
     current = search.fits[frozenset(current.effects)] = criterion.spared(current)
     return search, current, candidates, steps
 
 
-def _grown(
-    search: Search, current: Fit, singles: dict[str, Fit], ranked: list[str], steps: list[tuple[str, float]]
-) -> Fit:
-    """The model with effects added, one by one or the leading two at once, as long as each earns its place; ``steps``
-    gets a line for each.
+class EffectSelection:
+    """Effects of the library: one by one, or the leading two at once.
+
+    singles  fits with one effect each; ``ranked``: their names, best first
+    steps    gets a line for each step
     """
-    criterion, names = search.criterion, [e.name for e in search.stage.effects]
-    while len(current.effects) < criterion.most and criterion.fails(current):
-        names = [m for m in names if m not in (*current.effects, *criterion.left_out)]
-        options: list[Fit] = []
+
+    def __init__(self, search: Search, singles: dict[str, Fit], ranked: list[str], steps: list[tuple[str, float]]):
+        self.search, self.singles, self.ranked, self.steps = search, singles, ranked, steps
+        self.names = [e.name for e in search.stage.effects]  # what may still be added
+
+    def wants_more(self, current: Fit) -> bool:
+        """Whether the model stands above the noise and may have further effects."""
+        criterion = self.search.criterion
+        return len(current.effects) < criterion.most and criterion.fails(current)
+
+    def finalists(self, current: Fit) -> list[Fit]:
+        """The model with each further effect; without any so far, each effect and pairs of the leaders."""
+        search, criterion = self.search, self.search.criterion
+        names = self.names = [m for m in self.names if m not in (*current.effects, *criterion.left_out)]
         if current.effects:
-            options += search.best_of([(*current.effects, m) for m in names])
-        else:
-            options += [f for m, f in singles.items() if m in names]
-            leaders = [m for m in ranked if m in names][: criterion.leaders]
-            alone = [f for f in options if criterion.earns(current, f)]
-            # of a model that roams, pairs are tried where no effect helps alone; else where the best one leaves more
-            # than noise, and no other makes up for that beside it
-            tried = list(options)
-            if not criterion.roams and alone and _least(search, tried) > TOLERATED:
-                (first,) = min(alone, key=criterion.order).effects
-                tried += search.best_of([(first, m) for m in names if m != first])
-            if tried and not (criterion.roams and alone) and _least(search, tried) > TOLERATED:
-                options += search.best_of(list(itertools.combinations(leaders, 2)))
-        ok = [f for f in options if criterion.earns(current, f)]
-        if not ok and (other := _on_another_way(search, current, singles)) is not None:
-            ok = [other]
-        if not ok:
-            break
-        # fewest effects first: a pair must be significantly better than the best single, and that above the floor
-        ok.sort(key=lambda f: (len(f.effects), criterion.order(f)))
+            return search.best_of([(*current.effects, m) for m in names])
+        options = [f for m, f in self.singles.items() if m in names]
+        leaders = [m for m in self.ranked if m in names][: criterion.leaders]
+        alone = [f for f in options if criterion.earns(current, f)]
+        # of a model that roams, pairs are tried where no effect helps alone; else where the best one leaves more
+        # than noise, and no other makes up for that beside it
+        tried = list(options)
+        if not criterion.roams and alone and _least(search, tried) > TOLERATED:
+            (first,) = min(alone, key=criterion.order).effects
+            tried += search.best_of([(first, m) for m in names if m != first])
+        if tried and not (criterion.roams and alone) and _least(search, tried) > TOLERATED:
+            options += search.best_of(list(itertools.combinations(leaders, 2)))
+        return options
+
+    def accepted(self, current: Fit, tried: Sequence[Fit]) -> list[Fit]:
+        """Those that the criterion accepts; of none, the way by another leading effect."""
+        ok = [f for f in tried if self.search.criterion.earns(current, f)]
+        other = None if ok else _on_another_way(self.search, current, self.singles)
+        return ok if other is None else [other]
+
+    def chosen(self, current: Fit, accepted: Sequence[Fit]) -> Fit:
+        """The best with fewest effects: a pair must be accepted over the best single, and that be above the floor."""
+        criterion = self.search.criterion
+        ok = sorted(accepted, key=lambda f: (len(f.effects), criterion.order(f)))
         best = ok[0]
         for f in ok[1:]:
             if len(f.effects) == len(best.effects):
@@ -225,9 +240,19 @@ def _grown(
                     best = f
             elif criterion.fails(best) and criterion.earns(best, f):
                 best = f
-        current = best
-        steps.append((" + ".join(current.effects), rms_of(search.judge, current)))
-    return current
+        self._note(best)
+        return best
+
+    def pruned(self, models: list[Fit]) -> list[Fit]:
+        """The last model without what it does not need, and with what does as well and is simpler."""
+        search = self.search
+        last = search.criterion.settle(search, search.pruned(models[-1]))
+        if last.effects and last.effects != models[-1].effects:
+            self._note(last)
+        return [*models, last]
+
+    def _note(self, fit: Fit) -> None:
+        self.steps.append((" + ".join(fit.effects), rms_of(self.search.judge, fit)))
 
 
 def _least(search: Search, fits: list[Fit]) -> float:

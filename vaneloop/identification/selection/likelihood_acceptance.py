@@ -30,13 +30,21 @@ from vaneloop.identification.results import (
     rms_of,
     rms_per_output,
 )
+from vaneloop.identification.selection.rules import (
+    EXPLAINS_HALF,
+    KNOWN_NOISE,
+    LEAVES_LITTLE,
+    NAMED,
+    Comparison,
+    Decisions,
+    Naming,
+    Remainder,
+    gain,
+)
 from vaneloop.identification.settings import (
     BLOCK_SPREADS,
     CREDIBLE,
-    EXPLAINED,
     FLOOR_KNOWN,
-    LEAST_SHARE,
-    LEFT_FLOORS,
     NATS,
     RIVAL_NATS,
     RIVAL_SHARE,
@@ -49,8 +57,7 @@ if TYPE_CHECKING:
     from vaneloop.identification.selection.search import Search
 
 __all__ = [
-    "LikelihoodAcceptance", "as_close", "correlation_of", "gain",
-    "leaves_too_much", "significant", "with_rivals",
+    "LikelihoodAcceptance", "as_close", "correlation_of", "rival_nats", "significant", "with_rivals",
 ]  # fmt: skip
 
 BOUND = "fits only at the end of its physical range"
@@ -80,21 +87,6 @@ def correlation_of(judge: LeastSquaresProblem, fit: Fit) -> float:
     return min(worst, 50.0)
 
 
-def gain(judge: LeastSquaresProblem, before: Fit, after: Fit, correlation: float) -> tuple[float, float]:
-    """Return (nats, spreads): what ``after`` gains over ``before`` on held-out blocks."""
-    d = before.held_out - after.held_out
-    nats = 0.5 * float(d.sum()) / correlation
-    n = max(judge.n, 1)
-    spread = np.sqrt(correlation / (2.0 * n))
-    rms = [np.sqrt(max(f.held_out.sum(), 0.0) / n) for f in (before, after)]
-    overall = (rms[0] - rms[1]) / spread
-    m = np.maximum(judge.samples, 1)
-    local = (np.sqrt(np.maximum(before.held_out, 0.0) / m) - np.sqrt(np.maximum(after.held_out, 0.0) / m)) / np.sqrt(
-        correlation / (2.0 * m)
-    )
-    return nats, max(float(overall), SPREADS / BLOCK_SPREADS * float(np.sort(local)[-2:].mean()))
-
-
 def _above_floor(judge: LeastSquaresProblem, fit: Fit, correlation: float, known: float = FLOOR_KNOWN) -> bool:
     """True when the held-out error is above the noise floor, over the whole log or in single blocks, by more than the
     floor's spread.
@@ -110,12 +102,8 @@ def _above_floor(judge: LeastSquaresProblem, fit: Fit, correlation: float, known
 
 def significant(judge: LeastSquaresProblem, before: Fit, after: Fit, correlation: float) -> bool:
     """True when ``after`` is worth its extra effect."""
-    nats, spreads = gain(judge, before, after, correlation)
-    excess = before.held_out.sum() - judge.n
-    if before.held_out.sum() - after.held_out.sum() < LEAST_SHARE * excess:
-        return False
-    extra = max(len(after.free) - len(before.free), 1)
-    return nats > NATS + (extra - 1) and spreads > SPREADS
+    case = Comparison(judge, before, after, correlation)
+    return all(rule.verdict(case).holds for rule in KNOWN_NOISE)
 
 
 class LikelihoodAcceptance:
@@ -127,6 +115,7 @@ class LikelihoodAcceptance:
         self.judge, self.known = judge, known
         self.correlation = 1.0
         self.left_out: dict[str, str] = {}
+        self.decisions = Decisions()
 
     def begin(self, base: Fit) -> None:
         """Nothing: what is left is compared with noise."""
@@ -145,7 +134,10 @@ class LikelihoodAcceptance:
 
     def earns(self, before: Fit, after: Fit) -> bool:
         """Whether the gain is significant."""
-        return significant(self.judge, before, after, self.correlation)
+        if after is before:
+            return False
+        case = Comparison(self.judge, before, after, self.correlation)
+        return self.decisions.decide(KNOWN_NOISE, case, after.effects, before.effects)
 
     def gain(self, before: Fit, after: Fit) -> tuple[float, float]:
         """Nats and spreads."""
@@ -222,7 +214,7 @@ class LikelihoodAcceptance:
                 other = LeastSquaresProblem(replace(judge.stage, run=run), judge.floor, judge.valid)
                 twin = other.fit(current.effects, current.theta, 8)
                 if significant(judge, current, twin, correlation):
-                    found[-1] = replace(found[-1], refused=f"would have to turn on {cause}")
+                    found[-1] = replace(found[-1], other_cause=cause)
                 elif not _worse(judge, twin, current, correlation, 0.0):
                     found[-1] = replace(found[-1], inseparable=[cause])
         named = {f.effect: f.parameters for f in found}
@@ -240,46 +232,41 @@ class LikelihoodAcceptance:
         A name is only given where it explains the error: not by half, not with a size at the end of what is physically
         possible, and not where the same law with another cause (`Stage.twins`) does clearly better.
         """
-        judge, current, correlation = self.judge, fit, self.correlation
-        stage = judge.stage
-        n = max(judge.n, 1)
+        judge, current, decide = self.judge, fit, self.decisions.decide
         leading = [c.effect for c in candidates if c.nats > NATS]
-        refused = {f.effect: f.refused or BOUND for f in effects if f.refused or at_bound(stage, current, f.effect)}
-        gained, excess = (base.held_out.sum() - f for f in (current.held_out.sum(), n * (1.0 + FLOOR_KNOWN) ** 2))
-        if current.effects and gained < EXPLAINED * excess:
-            why = f"explains {max(gained, 0.0) / excess:.0%} of what exceeds the noise"
-            refused = dict.fromkeys(current.effects, why)
+        refused = {}
+        for f in effects:
+            case = Naming(
+                at_bound(judge.stage, current, f.effect),
+                *judge.stage.twins.get(f.effect, ("",))[:1],
+                bool(f.other_cause),
+            )
+            if not decide(NAMED, case, current.effects, tuple(e for e in current.effects if e != f.effect)):
+                refused[f.effect] = f"would have to turn on {f.other_cause}" if f.other_cause else BOUND
+        if not decide([EXPLAINS_HALF], left := self._left_by(base, current), current.effects, ()):
+            refused = dict.fromkeys(
+                current.effects, f"explains {max(left.explained, 0.0):.0%} of what exceeds the noise"
+            )
             effects, current = [], base
-        worst = float(np.max(rms_per_output(judge, current) / judge.floor))
-        too_much = leaves_too_much(
-            rms_of(judge, base), rms_of(judge, current), worst, len(current.effects), n, correlation
-        )
-        if too_much or (refused and current.effects):
+        little = decide(LEAVES_LITTLE, self._left_by(base, current), current.effects, ())
+        if not little or (refused and current.effects):
             verdict, effects = "unknown", []
         elif current.effects:
             verdict = "missing"
         else:
             verdict = "none"
-        out = answer_of(judge, verdict, base, current, effects, steps, candidates, correlation)
-        out.criterion = "noise_floor"
+        out = answer_of(judge, verdict, base, current, effects, steps, candidates, self.correlation)
+        out.criterion, out.decisions = "noise_floor", list(self.decisions)
         if verdict == "unknown":
             out.nearest = list(dict.fromkeys([*refused, *current.effects, *leading]))[:3]
             out.refused = [f"{name} {why}" for name, why in refused.items()]
         return out
 
-
-def leaves_too_much(before: float, after: float, worst: float, effects: int, n: int, correlation: float) -> bool:
-    """Whether a model is no answer, by what it leaves.
-
-    before, after  RMS error without and with its ``effects``, in noise floors; ``worst``: after, of the worst output
-    n, correlation samples, and how many of them count as one
-    """
-    if after <= max(TOLERATED, 1.0 + SPREADS * np.sqrt(correlation / (2.0 * n))):
-        return False
-    # each further effect is one more chance to imitate what the library does not have
-    left = 1.0 + (LEFT_FLOORS - 1.0) / max(effects, 1)
-    # no output is made up for by the others
-    return after**2 - 1.0 > LEAST_SHARE * max(before**2 - 1.0, 1e-12) or max(after, worst) > left
+    def _left_by(self, base: Fit, fit: Fit) -> Remainder:
+        judge = self.judge
+        worst = float(np.max(rms_per_output(judge, fit) / judge.floor))
+        n = max(judge.n, 1)
+        return Remainder(rms_of(judge, base), rms_of(judge, fit), worst, len(fit.effects), n, self.correlation)
 
 
 def as_close(judge: LeastSquaresProblem, d: StageDiagnosis, fit: Fit) -> bool:

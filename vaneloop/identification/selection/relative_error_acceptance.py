@@ -1,27 +1,18 @@
-"""The criterion of a model that will not come down to its sensors' noise: an effect must earn its place by what it does
-to the held-out error itself.
+"""Acceptance for a model that will not come down to its sensors' noise: by what an effect does to the held-out error.
 
-On real data small effects that nobody models dominate what is left. A threshold in noise floors or in nats then "finds"
-everything, since the errors of a wrong model are large, correlated and alike from sample to sample. So, block by block
-(blocks as in `identification.least_squares.problem`):
+On real data small effects that nobody models dominate what is left. A threshold in noise floors or in log-likelihood
+then "finds" everything, since the errors of a wrong model are large, correlated and alike from sample to sample. The
+rules are therefore shares, block by block (`identification.selection.rules`: `UNKNOWN_NOISE`, `OTHER_LOGS`). Shares of
+each block's own error give a block of small motion, which is wrong by a constant that suits the large motions, the same
+weight as these.
 
-- `LEAST_FALL`: what the held-out sum of squares has beyond noise falls by at least this share, and by at least
-  `LEAST_OF_NOISE` of the noise, whose level is known no better, and by what an error of `FORM` of all that laws are to
-  explain would be: the next law must not patch the form of those before it;
-- `LEAST_HELP`: of all relative change, block by block, at least this share is improvement. Relative, so that a block of
-  small motion, which is wrong by a constant that suits the large motions, counts as much as they do; a block that is
-  nearly perfect (`FLAT`, or the noise) cannot get better or worse;
-- at least two blocks agree;
-- no log that was kept for the test gets clearly worse (`HARM`), and some log gets better (`LEAST_USE`).
-
-The order in which sets of effects are preferred is `score`: the mean of the log error over all samples and of the log
-errors of the blocks, and 1 % for every parameter.
+Sets of effects are ordered by `score`: the mean of the log error over all samples and of the log errors of the blocks,
+and 1 % for every parameter.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,75 +20,32 @@ import numpy as np
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.regimes import agrees
 from vaneloop.identification.results import Candidate, Found, StageDiagnosis, answer_of, at_bound, parameters_of, rms_of
-from vaneloop.identification.settings import (
-    AGREE,
-    BETTER,
-    FLAT,
-    FORM,
-    HARM,
-    LEAST_FALL,
-    LEAST_HELP,
-    LEAST_OF_NOISE,
-    LEAST_USE,
-    MOST_LEFT,
-    PER_PARAMETER,
-    RIVAL,
-    STRUCTURE,
-    UNKNOWN,
+from vaneloop.identification.selection.rules import (
+    LEAVES_A_QUARTER,
+    OTHER_LOGS,
+    UNKNOWN_NOISE,
+    Comparison,
+    Decisions,
+    LogChanges,
+    Remainder,
 )
+from vaneloop.identification.settings import BETTER, FORM, PER_PARAMETER, RIVAL, STRUCTURE, UNKNOWN
 from vaneloop.identification.subsystem import Array
 
 if TYPE_CHECKING:
     from vaneloop.identification.selection.search import Search
 
-__all__ = ["RelativeErrorAcceptance", "structure", "worth"]
+__all__ = ["RelativeErrorAcceptance", "score", "structure"]
 
 
 Figures = Callable[[Array], Mapping[str, float]]  # parameters -> log -> log of its RMS error
 
 
-@dataclass
-class Evidence:
-    """What one fit gains on another, on held-out blocks.
-
-    fall   share of the sum of squares by which it falls
-    help   share of the change, block by block, that is improvement
-    agree  blocks that improve
-    least  share by which the sum of squares must fall
-    """
-
-    fall: float
-    help: float
-    agree: int
-    least: float = LEAST_FALL
-
-    @property
-    def good(self) -> bool:
-        """Whether it is enough."""
-        return self.fall >= self.least and self.help >= LEAST_HELP and self.agree >= 2
-
-
-def _levels(judge: LeastSquaresProblem, fit: Fit, least: float = 1.0) -> tuple[Array, Array]:
-    """Held-out sum of squares of every block, not below ``least`` (noise floors, RMS), and the number of samples."""
+def _levels(judge: LeastSquaresProblem, fit: Fit) -> tuple[Array, Array]:
+    """Held-out sum of squares of every block, not below its noise, and the number of samples."""
     use = judge.samples > 0
     m = judge.samples[use].astype(float)
-    return np.maximum(fit.held_out[use], m * least * least), m
-
-
-def worth(judge: LeastSquaresProblem, before: Fit, after: Fit, form: float = 0.0) -> Evidence:
-    """Evidence for ``after`` against ``before``.
-
-    form  error (noise floors) by which the equations of what is in the model already may be wrong
-    """
-    flat = max(1.0, FLAT * rms_of(judge, before))
-    (a, _), (b, _) = _levels(judge, before, flat), _levels(judge, after, flat)
-    r = np.log(a / b)
-    change = float(np.abs(r).sum())
-    was, noise = float(_levels(judge, before)[0].sum()), float(judge.n)
-    fall = 1.0 - float(_levels(judge, after)[0].sum()) / was
-    least = max(LEAST_FALL * (was - noise), LEAST_OF_NOISE * noise, form * form * noise) / was
-    helps = float(np.maximum(r, 0.0).sum()) / change if change > 0 else 0.0
-    return Evidence(fall, helps, int(np.sum(r > AGREE)), least)
+    return np.maximum(fit.held_out[use], m), m
 
 
 def score(judge: LeastSquaresProblem, fit: Fit, blocks: Array | None = None) -> float:
@@ -129,6 +77,7 @@ class RelativeErrorAcceptance:
         self.form = 0.0
         self.notes: list[str] = []
         self.left_out: dict[str, str] = {}  # effect that helped -> why it is not named
+        self.decisions = Decisions()
 
     def begin(self, base: Fit) -> None:
         """Note what the laws are to explain: their form is known to a share of it."""
@@ -151,13 +100,16 @@ class RelativeErrorAcceptance:
 
     def earns(self, before: Fit, after: Fit) -> bool:
         """Whether the evidence is good."""
-        return worth(self.judge, before, after, self.form).good
+        if after is before:
+            return False
+        case = Comparison(self.judge, before, after, form=self.form)
+        return self.decisions.decide(UNKNOWN_NOISE, case, after.effects, before.effects)
 
     def gain(self, before: Fit, after: Fit) -> tuple[float, float]:
         """Per cent of the held-out error; share of the change that is improvement."""
         judge = self.judge
         per_cent = 100.0 * (1.0 - rms_of(judge, after) / max(rms_of(judge, before), 1e-300))
-        return per_cent, worth(judge, before, after, self.form).help
+        return per_cent, Comparison(judge, before, after).share_improved
 
     # ---- the best model ----------------------------------------------------------------------------------------------
 
@@ -211,13 +163,10 @@ class RelativeErrorAcceptance:
             for name in fit.effects:
                 without = search.without(fit, name)
                 change = {log: with_it[log] - v for log, v in self.figures(without.theta).items() if log in with_it}
-                harmed = max((log for log in change if log in self.tests), key=lambda log: change[log], default=None)
-                if harmed is not None and change[harmed] > HARM:
-                    self.left_out[name] = f"makes {harmed} worse: {np.exp(change[harmed]):.2f} times the error"
-                elif change and min(change.values()) > -LEAST_USE:
-                    self.left_out[name] = f"no log is better by {LEAST_USE:.0%} for it"
-                else:
+                case = LogChanges(change, self.tests)
+                if self.decisions.decide(OTHER_LOGS, case, fit.effects, without.effects):
                     continue
+                self.left_out[name] = case.objection()
                 self.notes.append(f"{name} fits, but is not named: {self.left_out[name]}")
                 fit = without
                 break
@@ -316,18 +265,17 @@ class RelativeErrorAcceptance:
         for f in effects:
             if at_bound(stage, fit, f.effect):
                 self.notes.append(f"{f.effect} stands at the end of its physical range: the log would have it go on")
-        excess = max(rms_of(judge, base) ** 2 - 1.0, 1e-300)
-        share = max(left * left - 1.0, 0.0) / excess
-        poor = bool(effects) and left > UNKNOWN and share > MOST_LEFT
+        remainder = Remainder(rms_of(judge, base), left, left, len(effects))
+        poor = bool(effects) and not self.decisions.decide([LEAVES_A_QUARTER], remainder, fit.effects, ())
         verdict = "missing" if effects and not poor else "unknown" if unknown or poor else "none"
         if poor:  # no name rather than a poor one
             out = answer_of(judge, verdict, base, base, [], steps, candidates)
             out.nearest = list(dict.fromkeys(m for f in effects for m in (f.effect, *f.rivals)))[:3]
             named = " + ".join(f.effect for f in effects)
-            out.refused = [f"{named} comes nearest and leaves {np.sqrt(share):.0%} of the error"]
+            out.refused = [f"{named} comes nearest and leaves {np.sqrt(remainder.share_left):.0%} of the error"]
         else:
             out = answer_of(judge, verdict, base, fit, effects, steps, candidates)
-        out.criterion = "error_share"
+        out.criterion, out.decisions = "error_share", list(self.decisions)
         out.notes, out.gain = self.notes, "fall of the held-out error [%]"
         return out
 

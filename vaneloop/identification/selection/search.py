@@ -14,6 +14,7 @@ import numpy as np
 from vaneloop.identification.least_squares.broyden import NOT_KNOWN, bounded_step
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, Led, Task, finished, recalibrate
 from vaneloop.identification.selection.screening import Linearisation, along, followed, onward, out_of, within
+from vaneloop.identification.selection.stepwise import eliminate
 from vaneloop.identification.settings import DIRECTIONS, STARTS_TOGETHER
 from vaneloop.identification.subsystem import Array, Effect
 
@@ -478,13 +479,8 @@ class Search:
 
     def pruned(self, fit: Fit) -> Fit:
         """The fit without the effects that it does not need any more."""
-        while len(fit.effects) > 1:
-            less = [self.without(fit, drop) for drop in fit.effects]
-            idle = [f for f in less if not self.criterion.earns(f, fit)]
-            if not idle:
-                break
-            fit = min(idle, key=self.criterion.order)
-        return fit
+        less = lambda f: [self.without(f, drop) for drop in f.effects] if len(f.effects) > 1 else []  # noqa: E731
+        return eliminate(fit, less, self.criterion.earns, lambda idle: min(idle, key=self.criterion.order))
 
     def beside(self, rest: Sequence[str]) -> list[Fit]:
         """Fits made with one effect more than ``rest``."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import zip_longest
 
 import numpy as np
@@ -234,7 +235,7 @@ def _in_simulation(
         -mean(values),
     )
     further = (*tried.curves[:-1], (placed(*goes_on(ground, c, form, values)), effect))  # on test logs
-    return formula, tried.refitted(judge, fit, further)
+    return formula, replace(tried.refitted(judge, fit, further), form=form.name)
 
 
 # forms that are laws of the library, where the curve is of what is at its own place

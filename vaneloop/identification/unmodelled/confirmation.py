@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from vaneloop.identification.results import rms_of
+from vaneloop.identification.selection.rules import CONFIRMED, Confirmation
 from vaneloop.identification.settings import HARM, LEAST_FALL, LEAST_USE, MOST_LEFT, OTHER_AMPLITUDE, UNKNOWN
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
@@ -45,9 +46,17 @@ def another_confirms(learner: CurveProblem, before: FittedCandidate, tried: Fitt
     """
     if not tried.candidate.quantity.remembers:
         return True
+    return learner.decisions.decide([CONFIRMED], _confirmation(learner, before, tried), tried.names, before.names)
+
+
+def _confirmation(learner: CurveProblem, before: FittedCandidate, tried: FittedCandidate) -> Confirmation:
+    """What validation logs, else other logs, else other amplitudes leave with a curve, as a share of the sum of squares
+    without it.
+    """
     change, tests = learner.change(before, tried), learner.ground.tests
     if change and tests & set(change):
-        return min(change[log] for log in tests & set(change)) < -LEAST_USE
+        best = min(change[log] for log in tests & set(change))
+        return Confirmation(float(np.exp(2.0 * best)), float(np.exp(-2.0 * LEAST_USE)))
     far, log = moves(tried)
     small = far <= np.median(far)
     if log.any():
@@ -55,14 +64,15 @@ def another_confirms(learner: CurveProblem, before: FittedCandidate, tried: Fitt
     elif not small.all() and np.median(far[~small]) > OTHER_AMPLITUDE * np.median(far[small]) > 0.0:
         parts, most = [small], 1.0 - LEAST_FALL
     else:
-        return False
+        return Confirmation(np.inf, 1.0 - LEAST_FALL)
     fit, now = tried.fit, before.fit.cost if tried.settled is None else before.counted(tried.settled)[0]
+    left = []
     for held in parts:
         step = step_without(tried, held)
-        left = np.einsum("bij,i,j->b", fit.normals[held], step, step) - 2.0 * fit.gradients[held] @ step
-        if not (fit.cost[held] + left).sum() < most * now[held].sum():
-            return False
-    return True
+        change_of = np.einsum("bij,i,j->b", fit.normals[held], step, step) - 2.0 * fit.gradients[held] @ step
+        was = float(now[held].sum())
+        left.append(float((fit.cost[held] + change_of).sum()) / was if was > 0.0 else np.inf)
+    return Confirmation(max(left), most)
 
 
 def instead_of(learner: CurveProblem, named: FittedCandidate, curves: Sequence[FittedCandidate]) -> bool:

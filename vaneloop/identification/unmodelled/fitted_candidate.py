@@ -11,6 +11,7 @@ import numpy as np
 from vaneloop.identification.candidates.closed_forms import Formula
 from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known, bounded_step
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
+from vaneloop.identification.selection.rules import Decision
 from vaneloop.identification.settings import LEAST_FALL, LEAST_OF_NOISE, LEAST_SETTLED, NATS, SURELY
 from vaneloop.identification.subsystem import Array, Effect, Stage
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
@@ -102,6 +103,7 @@ class FittedCandidate:
     rows    whitened error of each sample and its derivatives, once they have been simulated
     formulas those that were fitted in its place, once they have been; ``loose``: those whose mean and slope may be what
              parameters of the model could have
+    form     name of the closed form that stands in the new curve's place; "": the curve itself
     """
 
     candidate: Candidate
@@ -115,6 +117,13 @@ class FittedCandidate:
     rows: tuple[Array, Array] | None = None
     formulas: list[tuple[Formula, FittedCandidate]] | None = None
     loose: list[FittedCandidate] | None = None
+    form: str = ""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects and curves of the model, for the record of decisions."""
+        names = self.fit.effects
+        return (*names[:-1], f"{names[-1]} as {self.form}") if self.form else names
 
     @property
     def settled(self) -> Array | None:
@@ -140,8 +149,9 @@ class FittedCandidate:
     def refitted(self, judge: LeastSquaresProblem, fit: Fit, curves: Placings) -> FittedCandidate:
         """The same candidate as another fit has it: nothing that was worked out of this one holds of that."""
         return replace(
-            self, judge=judge, fit=fit, curves=curves, told=None, errors=None, rows=None, formulas=None, loose=None
-        )
+            self, judge=judge, fit=fit, curves=curves, told=None, errors=None, rows=None, formulas=None, loose=None,
+            form="",
+        )  # fmt: skip
 
     def counted(self, known: Array) -> Blocks:
         """What its blocks hold at samples that count."""
@@ -172,6 +182,7 @@ class Outcome:
     tried    the model with its curves, curve by curve
     nearest  the candidates that come nearest, where nothing was learned
     why      in words, where nothing was learned
+    decisions  what the acceptance rules said of each candidate
     """
 
     verdict: str
@@ -179,6 +190,7 @@ class Outcome:
     nearest: list[str] = field(default_factory=list)
     why: str = ""
     notes: list[str] = field(default_factory=list)
+    decisions: list[Decision] = field(default_factory=list, repr=False)
 
 
 def strange(candidate: Candidate) -> int:

@@ -18,6 +18,8 @@ from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProbl
 from vaneloop.identification.regimes import agrees
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.selection.relative_error_acceptance import score
+from vaneloop.identification.selection.rules import DISSIPATES
+from vaneloop.identification.selection.stepwise import stepwise
 from vaneloop.identification.settings import (
     BENDS_TRIED,
     BETTER,
@@ -74,21 +76,36 @@ from vaneloop.identification.unmodelled.parametric_preference import (
 from vaneloop.identification.unmodelled.parametric_substitution import tell_each_by_its_formula
 from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.unmodelled.screening import screened, smoothed
-from vaneloop.identification.unmodelled.surface_search import put_surface
+from vaneloop.identification.unmodelled.surface_search import SurfaceSelection
 from vaneloop.identification.user_models.exogenous_regressors import TIME
-from vaneloop.identification.user_models.hysteresis_regressors import dissipates
+from vaneloop.identification.user_models.hysteresis_regressors import share_given_back
 
 __all__ = ["CurveSearch"]
 
 
 class CurveSearch(CurveProblem):
-    """The search for curves on one subsystem."""
+    """The search for curves on one subsystem: the candidates of `stepwise` are the model with one curve more.
+
+    out        what is learned, as far as it is known
+    by_formula of the last step, names of the curves that are accepted by a closed form only
+    ended      whether no further curve is looked for: a closed form leaves nothing but noise
+    """
+
+    out: Outcome
+    unknown: bool
+    by_formula: frozenset[str] = frozenset()
+    ended = False
 
     def learned(self) -> Outcome:
-        """Curves one after the other, each earning its place; at most two."""
-        out = Outcome("none")
-        unknown = self.d.verdict == "unknown"  # the diagnosis says that something is missing: so it is
-        if not (unknown or self.faint or self.form.fails(self.base)):
+        """Curves one after the other, at most two, then a surface in their place; each must be accepted."""
+        out = self._searched()
+        out.decisions = list(self.decisions)
+        return out
+
+    def _searched(self) -> Outcome:
+        out = self.out = Outcome("none")
+        self.unknown = self.d.verdict == "unknown"  # the diagnosis says that something is missing: so it is
+        if not (self.unknown or self.faint or self.form.fails(self.base)):
             out.why = "the model comes down to the noise of its samples: nothing is missing"
             return out
         named = self._named()
@@ -96,52 +113,68 @@ class CurveSearch(CurveProblem):
             out.verdict = "named"
             out.why = f"{' + '.join(self.d.final.effects)} of the library leaves nothing but noise"
             return out
-        current = FittedCandidate(self.candidates[0], 0.0, self.judge, self.base, ()) if self.candidates else None
-        while current is not None and len(out.tried) < MOST_CURVES:
-            if not self.fails(current) and (out.tried or not (unknown or self.faint)):
-                break
-            finalists = self._finalists(current)
-            out.nearest = out.nearest or [t.candidate.name for t in finalists[:3]]
-            good = [t for t in finalists if self._earns(current, t)]
-            poor = [t for t in finalists if t not in good]
-            only_said = earning_by_formula(self, current, poor, finalists) if self.speaks else []
-            good += only_said
-            if not good:
-                break
-            left = {t.candidate.name: self.left(current, t, good) for t in good}
-            self._with_formulas(current, good, left)
-            good = harmless(self, current, good, left)
-            good = without_memory(self, current, good)
-            self._tell_apart(good, left)
-            near = said_first(self, self._near(current, good, left), left)
-            best, harms = None, []
-            for chosen in (t for t in near if another_confirms(self, current, t)):  # what harms makes way for the next
-                last, why = self._as_learned(current, chosen)
-                if not why:
-                    best = last
-                    break
-                harms.append(f"{last.candidate.name} fits, but is not learned: {why}")
-            if best is None:
-                forgets = (
-                    f"{near[0].candidate.name} fits, but is not learned: it remembers, and neither another log nor "
-                    f"another amplitude confirms it"
-                )
-                out.notes += harms[:1] or [forgets]
-                break
-            limit = left[chosen.candidate.name] + RIVAL
-            rivals = [t.candidate.name for t in good if t is not chosen and left[t.candidate.name] < limit]
-            current = replace(best, rivals=rivals)
-            out.tried.append(current)
-            # what splines do not follow is no second law where a formula does
-            done = any(not self.fails(f) for _, f in current.formulas or ())
-            if done or best.candidate.name in [t.candidate.name for t in only_said]:
-                break
-        if len(out.tried) > 1:
-            self._spare_first(out)
-        if len(out.tried) > 1:
-            tell_each_by_its_formula(self, *out.tried)
-        put_surface(self, out)
+        if self.candidates:
+            nothing = FittedCandidate(self.candidates[0], 0.0, self.judge, self.base, ())
+            out.tried = stepwise(self, nothing)[1:]
+            surfaces = SurfaceSelection(self, out, nothing)
+            surface = stepwise(surfaces, surfaces.before)[1:]
+            out.tried = surface or out.tried
         return self._concluded(out, named)
+
+    # ---- the steps of `stepwise` -------------------------------------------------------------------------------------
+
+    def wants_more(self, current: FittedCandidate) -> bool:
+        """Whether the model leaves more than noise and may have another curve."""
+        curves = len(current.curves)
+        if self.ended or curves >= MOST_CURVES:
+            return False
+        return self.fails(current) or (not curves and (self.unknown or self.faint))
+
+    def accepted(self, current: FittedCandidate, tried: Sequence[FittedCandidate]) -> list[FittedCandidate]:
+        """Curves that the rules accept, by themselves or by a closed form, and that harm no validation log."""
+        self.out.nearest = self.out.nearest or [t.candidate.name for t in tried[:3]]
+        good = [t for t in tried if self._earns(current, t)]
+        poor = [t for t in tried if t not in good]
+        only_said = earning_by_formula(self, current, poor, tried) if self.speaks else []
+        self.by_formula = frozenset(t.candidate.name for t in only_said)
+        return [*good, *only_said]
+
+    def chosen(self, current: FittedCandidate, accepted: Sequence[FittedCandidate]) -> FittedCandidate | None:
+        """Of the curves that do as well as the best, the preferred one that other logs or amplitudes confirm."""
+        good = list(accepted)
+        left = {t.candidate.name: self.left(current, t, good) for t in good}
+        self._with_formulas(current, good, left)
+        good = harmless(self, current, good, left)
+        good = without_memory(self, current, good)
+        self._tell_apart(good, left)
+        near = said_first(self, self._near(current, good, left), left)
+        harms = []
+        for chosen in (t for t in near if another_confirms(self, current, t)):  # what harms makes way for the next
+            best, why = self._as_learned(current, chosen)
+            if not why:
+                break
+            harms.append(f"{best.candidate.name} fits, but is not learned: {why}")
+        else:
+            forgets = (
+                f"{near[0].candidate.name} fits, but is not learned: it remembers, and neither another log nor "
+                f"another amplitude confirms it"
+            )
+            self.out.notes += harms[:1] or [forgets]
+            return None
+        limit = left[chosen.candidate.name] + RIVAL
+        rivals = [t.candidate.name for t in good if t is not chosen and left[t.candidate.name] < limit]
+        # what splines do not follow is no second law where a formula does
+        self.ended = any(not self.fails(f) for _, f in best.formulas or ()) or best.candidate.name in self.by_formula
+        return replace(best, rivals=rivals)
+
+    def pruned(self, models: list[FittedCandidate]) -> list[FittedCandidate]:
+        """Without a first curve that only stood for what the second one is; the closed forms of those that stay."""
+        nothing, *curves = models
+        if len(curves) > 1:
+            curves = self._without_first(*curves)
+        if len(curves) > 1:
+            tell_each_by_its_formula(self, *curves)
+        return [nothing, *curves]
 
     def _as_learned(self, current: FittedCandidate, tried: FittedCandidate) -> tuple[FittedCandidate, str]:
         """A curve with the lag that suits it best, and without what parameters of the model can have; and why it is not
@@ -156,16 +189,16 @@ class CurveSearch(CurveProblem):
                 why = ""
         return best, why
 
-    def _spare_first(self, out: Outcome) -> None:
-        """Take out a first curve that only stood for what the second one is."""
-        first, second = out.tried
+    def _without_first(self, first: FittedCandidate, second: FittedCandidate) -> list[FittedCandidate]:
+        """The two curves; the second one alone where that does as well."""
         own = second.judge.stage.index()
         gone = {*range(own[first.candidate.name].start, own[first.candidate.name].stop)}
         theta = np.array([v for k, v in enumerate(second.fit.theta) if k not in gone])
         nothing = FittedCandidate(second.candidate, 0.0, self.judge, self.base, ())
         alone = self.fitted(nothing, second.candidate, second.wiggle, theta, 16)
         if self.score(alone, [alone, first]) <= self.score(second, [alone, first]) + BETTER:
-            out.tried = [replace(alone, told=second.told, rivals=second.rivals)]
+            return [replace(alone, told=second.told, rivals=second.rivals)]
+        return [first, second]
 
     def _named(self) -> tuple[LeastSquaresProblem, Fit] | None:
         """The best laws of the library, fitted with their held-out errors, where there are any."""
@@ -210,7 +243,8 @@ class CurveSearch(CurveProblem):
         c = tried.candidate
         if c.quantity.stops:
             table, amplitudes = tried.table()
-            if not dissipates(c.basis.low, c.basis.high, table(amplitudes)):
+            share = share_given_back(c.basis.low, c.basis.high, table(amplitudes))
+            if not self.decisions.decide([DISSIPATES], share, tried.names, before.names):
                 return False
         return self.worth(before, tried)
 
@@ -342,7 +376,7 @@ class CurveSearch(CurveProblem):
 
     # ---- candidates --------------------------------------------------------------------------------------------------
 
-    def _finalists(self, current: FittedCandidate) -> list[FittedCandidate]:
+    def finalists(self, current: FittedCandidate) -> list[FittedCandidate]:
         """The candidates that promise most, fitted; best first."""
         near, (bare, promising) = current.slopes(beside=False), screened(self, current, CURVES_QUICK, LAG_TIMES[0])
         quick: list[FittedCandidate] = []

@@ -10,22 +10,14 @@ And samples that nothing was fitted to must say so by themselves.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-
-import numpy as np
+from collections.abc import Iterable
 
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
-from vaneloop.identification.selection.likelihood_acceptance import (
-    LikelihoodAcceptance,
-    correlation_of,
-    gain,
-    rival_nats,
-)
-from vaneloop.identification.settings import LEAST_SHARE, NATS, RIVAL, SPREADS
-from vaneloop.identification.subsystem import Array
+from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, correlation_of, rival_nats
+from vaneloop.identification.settings import NATS, RIVAL
 from vaneloop.identification.unmodelled.fitted_candidate import CandidateSource
 
-__all__ = ["above_the_noise", "earns", "grain_of", "in_grains", "promises", "unconfirmed"]
+__all__ = ["above_the_noise", "grain_of", "in_grains", "promises"]
 
 
 def above_the_noise(judge: LeastSquaresProblem, fit: Fit) -> bool:
@@ -54,26 +46,3 @@ def promises(bare: float, best: float) -> bool:
     of the model's own parameters, and by that one.
     """
     return bare - best > 2.0 * NATS
-
-
-def earns(judge: LeastSquaresProblem, before: Fit, after: Fit, correlation: float) -> bool:
-    """Whether a curve gains enough nats on held-out blocks; ``correlation`` of the errors that it leaves."""
-    fall, excess = before.held_out.sum() - after.held_out.sum(), before.held_out.sum() - judge.n
-    extra = max(len(after.free) - len(before.free), 1)
-    return fall > LEAST_SHARE * excess and gain(judge, before, after, correlation)[0] > NATS + extra - 1
-
-
-def unconfirmed(before: Mapping[str, Array], after: Mapping[str, Array], tests: frozenset[str]) -> str:
-    """Why a curve is not believed, by the errors of all samples, log by log, in noise floors; "": it is.
-
-    tests  logs that nothing was fitted to
-    """
-    was, now = ({log: float(np.nansum(e * e)) for log, e in errors.items()} for errors in (before, after))
-    many = {log: int(np.isfinite(e).sum()) for log, e in after.items()}
-    for log in sorted(tests & set(now)):
-        nats = 0.5 * (was[log] - now[log])
-        if many[log] and nats < NATS:
-            return f"{log}: log-likelihood gain of {nats:.1f} only"
-    n = max(sum(many.values()), 1)
-    fall = (np.sqrt(sum(was.values()) / n) - np.sqrt(sum(now.values()) / n)) * np.sqrt(2.0 * n)
-    return "" if fall > SPREADS else f"the error falls by {fall:.1f} standard deviations of its noise only"

@@ -12,8 +12,18 @@ from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import StageDiagnosis
 from vaneloop.identification.selection.likelihood_acceptance import correlation_of
-from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance, score, worth
-from vaneloop.identification.settings import HARM, LEAST_USE
+from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance, score
+from vaneloop.identification.selection.rules import (
+    EXCESS,
+    GAIN,
+    NEAR_NOISE,
+    OTHER_LOGS,
+    UNKNOWN_NOISE,
+    AllRows,
+    Comparison,
+    Decisions,
+    LogChanges,
+)
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
 from vaneloop.identification.unmodelled.fitted_candidate import (
@@ -24,7 +34,7 @@ from vaneloop.identification.unmodelled.fitted_candidate import (
     told_by_others,
     with_held_out,
 )
-from vaneloop.identification.unmodelled.likelihood_acceptance import earns, grain_of, in_grains, unconfirmed
+from vaneloop.identification.unmodelled.likelihood_acceptance import grain_of, in_grains
 from vaneloop.identification.user_models.bound_system import rms_of_rows
 
 __all__ = ["CurveProblem"]
@@ -46,6 +56,7 @@ class CurveProblem:
     ):  # fmt: skip
         self.ground, self.d, self.progress, self.shape = ground, d, progress or (lambda _: None), tuple(shape)
         self.speaks = speaks
+        self.decisions = Decisions()
         self.ranked: list[list[FittedCandidate]] = []  # of each search for a curve, what was fitted, best first
         self.judge = self.judge_of((), ())
         self.base = self.judge.fit((), d.base.theta[: len(self.judge.stage.parameters)], 4)
@@ -109,9 +120,10 @@ class CurveProblem:
         """Whether a curve earns its place, where it knows something and what it is held against does."""
         among = [tried, before] if before.curves else [tried]
         (judge, was), (_, now) = (self.judged(t, among) for t in (before, tried))
-        if self.faint:
-            return earns(judge, was, now, correlation_of(tried.judge, tried.fit))
-        return worth(judge, was, now, self.form.form).good
+        correlation = correlation_of(tried.judge, tried.fit) if self.faint else 1.0
+        case = Comparison(judge, was, now, correlation, self.form.form)
+        rules = (EXCESS, GAIN) if self.faint else UNKNOWN_NOISE
+        return self.decisions.decide(rules, case, tried.names, before.names)
 
     def left(self, before: FittedCandidate, tried: FittedCandidate, among: Sequence[FittedCandidate]) -> float:
         """What orders candidates ``among`` which one is chosen: the score and what each makes of the test logs."""
@@ -146,15 +158,13 @@ class CurveProblem:
 
     def harmful(self, before: FittedCandidate, tried: FittedCandidate) -> str:
         """Why the logs speak against a curve; "": they do not."""
-        change = self.change(before, tried)
-        if self.faint and (why := unconfirmed(before.errors or {}, tried.errors or {}, self.ground.tests)):
-            return why
-        worst = max((log for log in change if log in self.ground.tests), key=lambda log: change[log], default=None)
-        if worst is not None and change[worst] > HARM:
-            return f"makes {worst} worse: {np.exp(change[worst]):.2f} times the error"
-        if change and min(change.values()) > -LEAST_USE:
-            return f"no log is better by {LEAST_USE:.0%} for it"
-        return ""
+        logs = LogChanges(self.change(before, tried), self.ground.tests)
+        sure = True
+        if self.faint:
+            rows = AllRows(before.errors or {}, tried.errors or {}, self.ground.tests)
+            sure = self.decisions.decide(NEAR_NOISE, rows, tried.names, before.names)
+        harmless = self.decisions.decide(OTHER_LOGS, logs, tried.names, before.names)
+        return rows.objection() if not sure else "" if harmless else logs.objection()
 
     def change(
         self, before: FittedCandidate, tried: FittedCandidate, part: Mapping[str, Array] | None = None

@@ -220,7 +220,7 @@ def _fitted(
         one.complexity + other.complexity, "", -mean(values), other.name,
     )  # fmt: skip
     further = (*tried.curves[:-1], (placed(reach_of(ground, tried, formula)), effect))
-    return formula, tried.refitted(judge, fit, further)
+    return formula, replace(tried.refitted(judge, fit, further), form=f"{one.name} times {other.name}")
 
 
 def reach_of(ground: CandidateSource, tried: FittedCandidate, formula: Product) -> Ends:

@@ -6,6 +6,7 @@ curves at one place: where two quantities do not act together, there is no surfa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations, zip_longest
 
@@ -32,39 +33,61 @@ from vaneloop.identification.unmodelled.screening import smoothed
 from vaneloop.identification.unmodelled.surface_candidates import SurfaceCandidate, may_be_of, surface_of
 from vaneloop.identification.unmodelled.surface_closed_forms import fitted_products
 
-__all__ = ["put_surface"]
+__all__ = ["SurfaceSelection"]
 
 
-def put_surface(learner: CurveProblem, out: Outcome) -> None:
-    """Put a surface in the place of the curves that were learned, where these leave clearly more than noise and it
-    earns that.
+class SurfaceSelection:
+    """A surface in place of the curves that were learned: the candidates of `stepwise` are models with one surface.
+
+    out      what has been learned: gets notes
+    nothing  the model without any curve
+    before   the model that a surface must be accepted over: the last curve's, or that without any
     """
-    last = out.tried[-1] if out.tried else None
-    before = (last.judge, last.fit) if last else (learner.judge, learner.base)
-    if not learner.ground.surfaces or learner.shape or not learner.ranked or rms_of(*before) <= UNKNOWN:
-        return
-    if last and any(not learner.fails(f) for _, f in last.formulas or ()):
-        return
-    nothing = FittedCandidate(learner.candidates[0], 0.0, learner.judge, learner.base, ())
-    done = _finished(learner, nothing)
-    sums = list(learner.each(lambda t: _sum(learner, nothing, t), done))
-    others = [nothing, *([last] if last else []), *sums]
-    good = [t for t in done if all(learner.worth(other, t) for other in others)]
-    if not good:
-        return
-    left = {t.candidate.name: learner.left(nothing, t, good) for t in good}
-    for t in good:
-        t.formulas = fitted_products(learner.ground, t)
-        for _, f in t.formulas:  # the product of two laws may be what splines are not, as a curve's formula
-            left[t.candidate.name] = min(left[t.candidate.name], learner.left(nothing, f, good))
-    least = min(left.values())
-    near = [t for t in good if left[t.candidate.name] < least + RIVAL]
-    best = min(near, key=lambda t: (*plain(t.candidate), left[t.candidate.name]))
-    why = learner.harmful(last or nothing, best)
-    if why and not any(_does_as_well(learner, last or nothing, best, f) for _, f in best.formulas or ()):
-        out.notes.append(f"{best.candidate.name} fits, but is not learned: {why}")
-        return
-    out.tried = [replace(best, rivals=[t.candidate.name for t in near if t is not best])]
+
+    def __init__(self, learner: CurveProblem, out: Outcome, nothing: FittedCandidate):
+        self.learner, self.out, self.nothing = learner, out, nothing
+        self.before = out.tried[-1] if out.tried else nothing
+
+    def wants_more(self, current: FittedCandidate) -> bool:
+        """Whether the curves, or their closed forms, leave clearly more than noise."""
+        learner = self.learner
+        if current is not self.before or learner.shape or not (learner.ground.surfaces and learner.ranked):
+            return False
+        if any(not learner.fails(f) for _, f in current.formulas or ()):
+            return False
+        return rms_of(current.judge, current.fit) > UNKNOWN
+
+    def finalists(self, current: FittedCandidate) -> list[FittedCandidate]:
+        """The surfaces that promise most, fitted to the end."""
+        return _finished(self.learner, self.nothing)
+
+    def accepted(self, current: FittedCandidate, tried: Sequence[FittedCandidate]) -> list[FittedCandidate]:
+        """Those that the rules accept over no curve, over the curves, and over every sum of two curves at one place."""
+        learner, nothing = self.learner, self.nothing
+        sums = list(learner.each(lambda t: _sum(learner, nothing, t), tried))
+        others = [nothing, *([current] if current is not nothing else []), *sums]
+        return [t for t in tried if all(learner.worth(other, t) for other in others)]
+
+    def chosen(self, current: FittedCandidate, accepted: Sequence[FittedCandidate]) -> FittedCandidate | None:
+        """Of those that do as well as the best the preferred one, unless it harms a validation log."""
+        learner, nothing, good = self.learner, self.nothing, list(accepted)
+        left = {t.candidate.name: learner.left(nothing, t, good) for t in good}
+        for t in good:
+            t.formulas = fitted_products(learner.ground, t)
+            for _, f in t.formulas:  # the product of two laws may be what splines are not, as a curve's formula
+                left[t.candidate.name] = min(left[t.candidate.name], learner.left(nothing, f, good))
+        least = min(left.values())
+        near = [t for t in good if left[t.candidate.name] < least + RIVAL]
+        best = min(near, key=lambda t: (*plain(t.candidate), left[t.candidate.name]))
+        why = learner.harmful(current, best)
+        if why and not any(_does_as_well(learner, current, best, f) for _, f in best.formulas or ()):
+            self.out.notes.append(f"{best.candidate.name} fits, but is not learned: {why}")
+            return None
+        return replace(best, rivals=[t.candidate.name for t in near if t is not best])
+
+    def pruned(self, models: list[FittedCandidate]) -> list[FittedCandidate]:
+        """As they are: there is one surface at most."""
+        return models
 
 
 def _does_as_well(

@@ -12,10 +12,12 @@ import numpy as np
 from vaneloop.base.compiled import compiled
 from vaneloop.base.durations import in_name, named_lag
 from vaneloop.base.hysteresis import STOPS, slipped, weights_of
-from vaneloop.identification.settings import BEFORE_LOG, COARSE_STOPS, NEGATIVE_STOPS, NO_TURN
+from vaneloop.identification.settings import BEFORE_LOG, COARSE_STOPS, NO_TURN
 from vaneloop.identification.subsystem import Array
 
-__all__ = ["STOPS", "dissipates", "forgotten", "is_memory", "lagged", "lagged_name", "named_lag", "of_stops", "swings"]
+__all__ = [
+    "STOPS", "forgotten", "is_memory", "lagged", "lagged_name", "named_lag", "of_stops", "share_given_back", "swings",
+]  # fmt: skip
 
 
 def is_memory(name: str) -> bool:
@@ -46,11 +48,14 @@ def of_stops(q: Array, low: float, high: float, table: Array) -> Array:
     return np.asarray(slipped(np.ascontiguousarray(q, dtype=float), high, weights_of(low, high, table)))
 
 
-def dissipates(low: float, high: float, table: Array) -> bool:
-    """Whether the stops of a virgin curve, seen coarsely, have weights of one sign: then they only take energy."""
+def share_given_back(low: float, high: float, table: Array) -> float:
+    """Share of the stops of a virgin curve, seen coarsely, that give energy: those whose weight has the rarer sign.
+    Stops with weights of one sign only take energy. Infinite where there are none.
+    """
     weights = weights_of(low, high, table, COARSE_STOPS)[:-1]  # the last one stands for all that is wider
     size = float(np.abs(weights).sum())
-    return size > 0.0 and min(np.maximum(weights, 0.0).sum(), np.maximum(-weights, 0.0).sum()) <= NEGATIVE_STOPS * size
+    least = float(min(np.maximum(weights, 0.0).sum(), np.maximum(-weights, 0.0).sum()))
+    return least / size if size > 0.0 else np.inf
 
 
 def forgotten(q: Array, high: float, table: Array) -> Array:

@@ -17,7 +17,8 @@ from plant import Model, build_plant
 from plant.effects import EFFECTS
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import floor_of
-from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, correlation_of, gain
+from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, correlation_of
+from vaneloop.identification.selection.rules import gain
 from vaneloop.identification.selection.search import Search
 from vaneloop.identification.settings import MARGIN, MOST_REPEATS, NATS, RIVAL_SPREADS
 from vaneloop.identification.vane_chain.chain import build_chain

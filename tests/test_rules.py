@@ -1,0 +1,210 @@
+"""Acceptance rules as objects: their verdicts are the conditions, and an answer holds every one of them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as settings_of
+from hypothesis import strategies as st
+
+from tests.conftest import examples
+from vaneloop import Record, System, unknown
+from vaneloop.cli import explain as command
+from vaneloop.identification import settings
+from vaneloop.identification.least_squares.problem import Fit
+from vaneloop.identification.selection import rules
+from vaneloop.identification.selection.rules import RULES, Comparison, Decision, Decisions, LogChanges, Remainder
+from vaneloop.identification.selection.stepwise import eliminate, stepwise
+from vaneloop.pages.decisions import decision_table, explain, reasons
+from vaneloop.pages.page import Page
+from vaneloop.verbs.learn import learn
+
+BLOCKS = 6
+LEVELS = st.lists(st.floats(0.2, 50.0), min_size=BLOCKS, max_size=BLOCKS)
+
+
+def comparison(before: list[float], after: list[float], form: float = 0.0) -> Comparison:
+    """Two fits with these mean squares, block by block, of 50 samples each."""
+    samples = np.full(BLOCKS, 50)
+    judge: Any = SimpleNamespace(n=int(samples.sum()), samples=samples, n_blocks=BLOCKS)
+    none = np.zeros(0)
+    fits = [
+        Fit((), none, np.zeros(k, dtype=int), np.array(level) * samples, np.array(level) * samples, none, none, none,
+            none, none)
+        for k, level in ((2, before), (3, after))
+    ]  # fmt: skip
+    return Comparison(judge, fits[0], fits[1], 1.0, form)
+
+
+@given(before=LEVELS, after=LEVELS)
+@settings_of(max_examples=examples(60), deadline=None)
+def test_against_a_known_noise_the_rules_are_the_three_conditions(before: list[float], after: list[float]) -> None:
+    c = comparison(before, after)
+    was, now, n = 50.0 * sum(before), 50.0 * sum(after), 50.0 * BLOCKS
+    gain = 0.5 * (was - now)
+    deviations = (np.sqrt(was / n) - np.sqrt(now / n)) * np.sqrt(2.0 * n)
+    blocks = sorted((np.sqrt(a) - np.sqrt(b)) * np.sqrt(2.0 * 50.0) for a, b in zip(before, after, strict=True))
+    local = settings.SPREADS / settings.BLOCK_SPREADS * np.mean(blocks[-2:])
+    expected = was - now >= settings.LEAST_SHARE * (was - n) and gain > settings.NATS
+    expected = expected and max(deviations, local) > settings.SPREADS
+    assert all(r.verdict(c).holds for r in rules.KNOWN_NOISE) == expected
+
+
+@given(before=LEVELS, after=LEVELS, form=st.floats(0.0, 3.0))
+@settings_of(max_examples=examples(60), deadline=None)
+def test_against_an_unknown_noise_the_rules_are_the_three_conditions(
+    before: list[float], after: list[float], form: float
+) -> None:
+    c = comparison(before, after, form)
+    a, b = (np.maximum(level, 1.0) for level in (before, after))
+    noise = float(BLOCKS)
+    least = max(settings.LEAST_FALL * (a.sum() - noise), settings.LEAST_OF_NOISE * noise, form**2 * noise)
+    flat = max(1.0, settings.FLAT**2 * np.mean(before))
+    r = np.log(np.maximum(before, flat) / np.maximum(after, flat))
+    helps = np.maximum(r, 0.0).sum() / np.abs(r).sum() if np.abs(r).sum() > 0.0 else 0.0
+    expected = a.sum() - b.sum() >= least - 1e-12 and helps >= settings.LEAST_HELP
+    expected = bool(expected and np.sum(r > settings.AGREE) >= 2)
+    assert all(rule.verdict(c).holds for rule in rules.UNKNOWN_NOISE) == expected
+
+
+@given(bad=st.sampled_from([np.nan, np.inf]), at=st.integers(0, BLOCKS - 1))
+@settings_of(max_examples=examples(20), deadline=None)
+def test_an_error_that_is_not_finite_is_never_accepted(bad: float, at: int) -> None:
+    after = [1.0] * BLOCKS
+    after[at] = bad
+    c = comparison([40.0] * BLOCKS, after)
+    for table in (rules.KNOWN_NOISE, rules.UNKNOWN_NOISE):
+        assert not all(r.verdict(c).holds for r in table)
+    left = Remainder(40.0, bad, bad, 1, 300)
+    assert not left.is_noise and not any(r.verdict(left).holds for r in rules.LEAVES_LITTLE)
+
+
+def test_a_validation_log_that_gets_worse_objects_and_says_so() -> None:
+    harm = LogChanges({"a": -0.5, "b": 0.2}, frozenset("b"))
+    assert harm.objection() == "makes b worse: 1.22 times the error"
+    assert LogChanges({"a": -0.01}, frozenset()).objection() == "no log is better by 2% for it"
+    assert LogChanges({"a": -0.5, "b": 0.05}, frozenset("b")).objection() == ""
+
+
+def test_decisions_keep_the_latest_verdict_of_each_rule_on_each_pair() -> None:
+    d = Decisions()
+    assert not d.decide(rules.OTHER_LOGS, LogChanges({"a": 0.3}, frozenset("a")), ("x",), ())
+    assert d.decide([rules.LEAVES_A_QUARTER], Remainder(10.0, 2.0, 2.0, 1), ("x",), ())
+    assert d.decide(rules.OTHER_LOGS, LogChanges({"a": -0.3}, frozenset("a")), ("x",), ())
+    assert not d.decide(rules.OTHER_LOGS, LogChanges({"a": 0.3}, frozenset("a")), ("x", "y"), ("x",))
+    first, second = list(Decisions(list(d)))  # a search that goes on from another keeps its decisions
+    assert [v.rule for v in first.verdicts] == ["validation logs", "best log", "error left"] and first.accepted
+    assert second == Decision(("x", "y"), ("x",), second.verdicts) and not second.accepted
+
+
+def test_every_rule_has_a_name_of_its_own_and_a_sentence_for_its_reason() -> None:
+    objects = [v for v in vars(rules).values() if isinstance(v, rules.Rule)]
+    tables = [r for v in vars(rules).values() if isinstance(v, tuple) for r in v if isinstance(r, rules.Rule)]
+    assert {id(r) for r in (*objects, *tables)} == {id(r) for r in RULES.values()}
+    assert all(r.reason[0].isupper() and r.reason.endswith(".") and r.unit for r in RULES.values())
+
+
+class Sums:
+    """Stepwise selection on numbers: add what brings a sum nearer to a target."""
+
+    def __init__(self, target: int, numbers: list[int]):
+        self.target, self.numbers = target, numbers
+
+    def left(self, model: tuple[int, ...]) -> int:
+        return abs(self.target - sum(model))
+
+    def wants_more(self, model: tuple[int, ...]) -> bool:
+        return self.left(model) > 0
+
+    def finalists(self, model: tuple[int, ...]) -> list[tuple[int, ...]]:
+        return sorted(((*model, n) for n in self.numbers), key=self.left)
+
+    def accepted(self, model: tuple[int, ...], tried: Any) -> list[tuple[int, ...]]:
+        return [t for t in tried if self.left(t) < self.left(model)]
+
+    def chosen(self, model: tuple[int, ...], accepted: Any) -> tuple[int, ...] | None:
+        return accepted[0]
+
+    def pruned(self, models: list[tuple[int, ...]]) -> list[tuple[int, ...]]:
+        less = lambda m: [m[:k] + m[k + 1 :] for k in range(len(m))]  # noqa: E731
+        needed = lambda fewer, more: self.left(fewer) > self.left(more)  # noqa: E731
+        return [*models, eliminate(models[-1], less, needed, lambda idle: idle[0])]
+
+
+@given(target=st.integers(0, 60), numbers=st.lists(st.integers(1, 9), min_size=1, max_size=5))
+@settings_of(max_examples=examples(50), deadline=None)
+def test_a_step_never_leaves_more_and_the_last_model_needs_all_that_it_has(target: int, numbers: list[int]) -> None:
+    s = Sums(target, numbers)
+    models = stepwise(s, ())
+    left = [s.left(m) for m in models]
+    assert models[0] == () and left == sorted(left, reverse=True)
+    last = models[-1]
+    assert all(s.left(last[:k] + last[k + 1 :]) > s.left(last) for k in range(len(last)))
+    assert not s.wants_more(last) or not s.accepted(last, s.finalists(last))
+
+
+# ---- in answers ------------------------------------------------------------------------------------------------------
+
+VALVE = System(
+    "valve", "static", lambda u, p: p.g * u.lift + p.zero, inputs={"lift": "mm"}, outputs={"flow": "l/min"},
+    parameters=[unknown("g", 1.5, "l/(min mm)"), unknown("zero", 0.1, "l/min")],
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def answer() -> Any:
+    """A valve whose flow bends: what learn says of it."""
+    rng = np.random.default_rng(4)
+    t = np.arange(800) * 0.01
+    lift = sum(rng.uniform(0.3, 0.6) * np.sin(2.0 * np.pi * f * t + rng.uniform(0.0, 6.0)) for f in (0.3, 0.7, 1.1))
+    flow = 2.0 * lift + 0.5 + 3.0 * np.tanh(2.0 * lift) + 0.02 * rng.standard_normal(len(t))
+    return learn([Record("bench", t, {"lift": lift, "flow": flow})], VALVE)
+
+
+def test_an_answer_holds_the_verdict_of_every_rule(answer: Any) -> None:
+    said = json.loads(json.dumps(answer.to_dict(), allow_nan=False))["decisions"]
+    assert answer.verdict == "learned" and said
+    chosen = [d for d in said if d["added"] == [answer.laws[0].name] and d["beside"] == []]
+    assert len(chosen) == 1 and chosen[0]["accepted"]
+    assert {"share of the error", "share improved", "blocks that improve"} <= {v["rule"] for v in chosen[0]["rules"]}
+    for d in said:
+        assert d["accepted"] == all(v["holds"] for v in d["rules"])
+        for v in d["rules"]:
+            if v["value"] is not None and v["limit"] is not None:
+                at_most = RULES[v["rule"]].at_most
+                assert v["holds"] == (v["value"] <= v["limit"] if at_most else v["value"] >= v["limit"])
+    found = answer.diagnosed.to_dict()["decisions"]
+    assert {d["stage"] for d in found} == {"valve"} and any(d["accepted"] for d in found)
+
+
+def test_the_table_marks_what_was_chosen_and_the_page_folds_it(answer: Any) -> None:
+    ((name, (decisions, chosen)),) = answer.explained.items()
+    columns, rows = decision_table(decisions, chosen)
+    assert rows[0][0] == answer.laws[0].name and rows[0][2] == "chosen"
+    assert all(len(row) == len(columns) for row in rows) and columns[3:] == [r[0] for r in reasons(decisions)]
+    assert all(("<" in cell or ">" in cell) <= (row[2] == "rejected") for row in rows for cell in row[3:])
+    page = Page("t", "v")
+    explain(page, {name: (decisions, chosen)})
+    assert "<details><summary>Acceptance rules" in page.html() and "</details>" in page.html()
+    assert page.html().count("<details>") == 2
+
+
+def test_explain_prints_every_decision_and_the_reason_of_every_rule(
+    answer: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    args = argparse.Namespace(explain=True, quiet=False, json=None)
+    command.show(args, answer.explained)
+    printed = " ".join(capsys.readouterr().out.split())
+    decisions = answer.explained["valve"][0]
+    assert f"valve: {len(decisions)} decisions of the acceptance rules" in printed
+    for name, _, _, reason in reasons(decisions):
+        assert name in printed and " ".join(reason.split()[:4]) in printed
+    args.explain = False
+    command.show(args, answer.explained)
+    assert capsys.readouterr().out == ""
