@@ -251,7 +251,7 @@ def test_pairs_are_tried_with_the_two_effects_that_lead_beside_the_model_s(monke
         assert [s[1] for s in sets] == [m for m in "abcde" if m != sets[0][0]]
         return [SimpleNamespace(effects=sets[0], left=9.0)]
 
-    criterion = SimpleNamespace(roams=True, left_out={}, earns=lambda a, b: b.left < a.left, order=lambda f: f.left)
+    criterion = SimpleNamespace(roams=True, left_out={}, accepts=lambda a, b: b.left < a.left, order=lambda f: f.left)
     effects = [SimpleNamespace(name=n) for n in "abcde"]
     search: Any = SimpleNamespace(
         criterion=criterion, base=SimpleNamespace(left=100.0), stage=SimpleNamespace(effects=effects), best_of=best_of

@@ -886,7 +886,7 @@ def test_what_harms_a_test_log_makes_way_for_what_does_not_and_is_near_it() -> N
         return SimpleNamespace(candidate=SimpleNamespace(name=name), loose=list(formulas))
 
     bad, fine, said = named("bad"), named("fine"), named("said", named("formula"))
-    learner: Any = SimpleNamespace(harmful=lambda _, t: "" if t.candidate.name in ("fine", "formula") else "worse")
+    learner: Any = SimpleNamespace(objection=lambda _, t: "" if t.candidate.name in ("fine", "formula") else "worse")
     before: Any = None
     assert harmless(learner, before, [bad, fine, said], {"bad": 0.0, "fine": 0.4, "said": 0.3}) == [fine, said]
     assert harmless(learner, before, [bad, fine], {"bad": 0.0, "fine": 0.6}) == [bad, fine]

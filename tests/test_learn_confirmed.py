@@ -142,7 +142,7 @@ def test_a_curve_at_its_place_is_asked_by_its_formula_however_far_its_splines_go
         )  # fmt: skip
 
     learner: Any = SimpleNamespace(
-        score=lambda t, among: t.score, worth=lambda _, f: f.good, ground=SimpleNamespace(shares=False)
+        score=lambda t, among: t.score, accepts=lambda _, f: f.good, ground=SimpleNamespace(shares=False)
     )
     before = tried(False, 0.0, 4.0, False)
     best, elsewhere = tried(False, 0.4, 1.0, False), tried(False, 2.0, 0.9, True)

@@ -357,7 +357,7 @@ def test_where_a_formula_of_a_plainer_curve_goes_before_the_best_curve_all_have_
         return Values(candidate=candidate, fit=Values(cost=np.ones(1), free=[0]), judge=Values(n=1), loose=[said])
 
     learner: Any = Values(
-        fails=lambda _: False, harmful=lambda *_: "", ground=Values(shares=False), left=lambda _, f, __: f.left
+        fails=lambda _: False, objection=lambda *_: "", ground=Values(shares=False), left=lambda _, f, __: f.left
     )
     for plainer, expected in ((-0.5, {"a": -0.5, "a_minus_b": -2.0}), (0.2, {"a": 0.2, "a_minus_b": 0.0})):
         left = {"a": 0.3, "a_minus_b": 0.0}

@@ -293,12 +293,12 @@ def test_a_hum_beside_a_gain_that_drifts_is_the_second_law(drifting) -> None:
 def test_a_second_law_that_harms_a_log_is_told_and_the_first_one_stands(drifting, monkeypatch) -> None:
     """The same logs, with the candidates that were found for them."""
     _, diagnosis, found = drifting
-    harmful = CurveSearch.harmful
+    harmful = CurveSearch.objection
 
     def second_harms(self, current, best) -> str:
         return "makes two worse" if current.curves else harmful(self, current, best)
 
-    monkeypatch.setattr(CurveSearch, "harmful", second_harms)
+    monkeypatch.setattr(CurveSearch, "objection", second_harms)
     monkeypatch.setattr(CurveSearch, "finalists", lambda self, current: found[step_of(self, current)])
     monkeypatch.setattr("vaneloop.verbs.learn.diagnose", lambda *_, **__: diagnosis)
     answer = learned_where_the_gain_drifts()

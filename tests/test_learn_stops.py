@@ -205,7 +205,7 @@ def test_of_what_a_bushing_may_be_the_hysteresis_at_the_crank_is_best(monkeypatc
     before = FittedCandidate(learner.candidates[0], 0.0, learner.judge, learner.base, ())
     best = learner.finalists(before)[0]
     assert best.candidate.at == "linkage.crank"
-    assert learner._earns(before, best) and another_confirms(learner, before, best)
+    assert learner.allowed(before, best) and another_confirms(learner, before, best)
     # its first spline is wider than the bushing's first play
     assert rms_of(best.judge, best.fit) < 0.2 * rms_of(learner.judge, learner.base)
     table, amplitudes = best.table()

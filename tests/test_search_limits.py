@@ -74,7 +74,7 @@ def rms_after(judge: Any, nats: float) -> float:
     return float(np.sqrt(1.0 + 2.0 * nats / judge.n))
 
 
-# ---- is an effect worth its place? -----------------------------------------------------------------------------------
+# ---- is an effect accepted? -----------------------------------------------------------------------------------------
 
 
 @SIDES

@@ -1,8 +1,8 @@
 """Which effects is a stage missing? Screening, pairs of the leaders, pruning, rivals, and what is left.
 
-The fits are those of `identification.selection.search`. What earns an effect its place is for the criterion to say:
-`LikelihoodAcceptance` for a model that may come down to the noise of its log, `RelativeErrorAcceptance` for one that
-will not.
+The loop is `identification.selection.stepwise`, the fits are those of `identification.selection.search`. The criterion
+accepts an effect or not: `LikelihoodAcceptance` for a model that may come down to the noise of its log,
+`RelativeErrorAcceptance` for one that will not.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _confirm(
             else judge.together([judge.fitting(r, b, 6) for r, b in zip(rest, begins, strict=True)])
         )
 
-    current = eliminate(current, without, criterion.earns, lambda idle: idle[0])
+    current = eliminate(current, without, criterion.accepts, lambda idle: idle[0])
     chosen = current.effects
     effects = [
         replace(f, parameters=parameters_of(stage, current, f.effect)) for f in said.effects if f.effect in chosen
@@ -212,7 +212,7 @@ class EffectSelection:
             return search.best_of([(*current.effects, m) for m in names])
         options = [f for m, f in self.singles.items() if m in names]
         leaders = [m for m in self.ranked if m in names][: criterion.leaders]
-        alone = [f for f in options if criterion.earns(current, f)]
+        alone = [f for f in options if criterion.accepts(current, f)]
         # of a model that roams, pairs are tried where no effect helps alone; else where the best one leaves more
         # than noise, and no other makes up for that beside it
         tried = list(options)
@@ -225,7 +225,7 @@ class EffectSelection:
 
     def accepted(self, current: Fit, tried: Sequence[Fit]) -> list[Fit]:
         """Those that the criterion accepts; of none, the way by another leading effect."""
-        ok = [f for f in tried if self.search.criterion.earns(current, f)]
+        ok = [f for f in tried if self.search.criterion.accepts(current, f)]
         other = None if ok else _on_another_way(self.search, current, self.singles)
         return ok if other is None else [other]
 
@@ -238,7 +238,7 @@ class EffectSelection:
             if len(f.effects) == len(best.effects):
                 if criterion.order(f) < criterion.order(best):
                     best = f
-            elif criterion.fails(best) and criterion.earns(best, f):
+            elif criterion.fails(best) and criterion.accepts(best, f):
                 best = f
         self._note(best)
         return best
@@ -269,12 +269,12 @@ def _on_another_way(search: Search, current: Fit, singles: dict[str, Fit]) -> Fi
     criterion = search.criterion
     if not criterion.roams or not current.effects or len(current.effects) > 2:
         return None
-    others = [m for m, f in singles.items() if criterion.earns(search.base, f)]
+    others = [m for m, f in singles.items() if criterion.accepts(search.base, f)]
     others = [m for m in others if m not in (*current.effects, *criterion.left_out)]
     others.sort(key=lambda m: criterion.order(singles[m]))
     names = [e.name for e in search.stage.effects if e.name not in criterion.left_out]
     pairs = [f for o in others[:PAIR_LEADERS] for f in search.best_of([(o, m) for m in names if m != o])[:1]]
-    pairs = [f for f in pairs if set(f.effects) != set(current.effects) and criterion.earns(current, f)]
+    pairs = [f for f in pairs if set(f.effects) != set(current.effects) and criterion.accepts(current, f)]
     return min(pairs, key=criterion.order, default=None)
 
 

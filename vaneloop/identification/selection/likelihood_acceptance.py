@@ -1,15 +1,12 @@
-"""The criterion of a model that may come down to the noise of its log: an effect must earn its place against a noise
-floor that is known.
+"""Acceptance for a model that may come down to the noise of its log: an effect is compared with a known noise floor.
 
-Two measures, both from the held-out errors of the log's blocks:
+Two measures, both from the held-out errors of the log's blocks (`identification.selection.rules.gain`):
 
-- *nats*: half the fall of the whitened sum of squares, divided by how correlated the errors are (an error that repeats
-  itself n times is one observation, not n);
-- *spreads*: the fall of the RMS error in units of the noise floor's own spread, over the whole log, or within the
-  blocks where it acts.
+- the gain of log-likelihood: half the fall of the normalised sum of squares, divided by how correlated the errors are
+  (an error that repeats itself n times is one observation, not n);
+- the fall of the RMS error in standard deviations of it, over the whole log or within the blocks where the effect acts.
 
-A gain counts when it passes both thresholds. They are set on the maximum over the library under "nothing missing"
-(docs/diagnosis.md).
+Both limits follow from the maximum over the library when nothing is missing (docs/diagnosis.md).
 """
 
 from __future__ import annotations
@@ -101,7 +98,7 @@ def _above_floor(judge: LeastSquaresProblem, fit: Fit, correlation: float, known
 
 
 def significant(judge: LeastSquaresProblem, before: Fit, after: Fit, correlation: float) -> bool:
-    """True when ``after`` is worth its extra effect."""
+    """Whether the rules accept the further effects of ``after``."""
     case = Comparison(judge, before, after, correlation)
     return all(rule.verdict(case).holds for rule in KNOWN_NOISE)
 
@@ -132,7 +129,7 @@ class LikelihoodAcceptance:
         """Whether the error stands above the floor."""
         return _above_floor(self.judge, fit, self.correlation, self.known)
 
-    def earns(self, before: Fit, after: Fit) -> bool:
+    def accepts(self, before: Fit, after: Fit) -> bool:
         """Whether the gain is significant."""
         if after is before:
             return False

@@ -98,7 +98,7 @@ class RelativeErrorAcceptance:
         """Every effect that changes an output at all can be seen."""
         return reach > 0.0
 
-    def earns(self, before: Fit, after: Fit) -> bool:
+    def accepts(self, before: Fit, after: Fit) -> bool:
         """Whether the evidence is good."""
         if after is before:
             return False
@@ -128,7 +128,7 @@ class RelativeErrorAcceptance:
                 rest = tuple(e for e in fit.effects if e != drop)
                 options = search.best_of([(*rest, n) for n in names if n not in fit.effects])
                 better = [f for f in options if self.order(f) < self.order(best) - BETTER]
-                best = next((f for f in better if len(f.free) <= len(best.free) or self.earns(best, f)), best)
+                best = next((f for f in better if len(f.free) <= len(best.free) or self.accepts(best, f)), best)
             if best is fit:
                 return fit
             fit = search.pruned(best)
@@ -142,16 +142,16 @@ class RelativeErrorAcceptance:
         for drop in [e for e in fit.effects if size[e] > 1]:
             rest = search.joined(tuple(e for e in fit.effects if e != drop))
             free = [n for n in names if n not in rest.effects and size[n] < size[drop]]
-            one = [f for f in search.best_of([(*rest.effects, n) for n in free]) if self.earns(rest, f)]
+            one = [f for f in search.best_of([(*rest.effects, n) for n in free]) if self.accepts(rest, f)]
             single = [n for n in free if size[n] == 1] if size[drop] > 2 else []
             two = [
                 g
                 for f in [f for f in one if f.effects[-1] in single][:2]
                 for g in search.best_of([(*f.effects, n) for n in single if n not in f.effects])
-                if self.earns(f, g)
+                if self.accepts(f, g)
             ]
             held = search.simpler(fit, drop)
-            options = [f for f in (*one, *two, *held) if len(f.free) < len(fit.free) and not self.earns(f, fit)]
+            options = [f for f in (*one, *two, *held) if len(f.free) < len(fit.free) and not self.accepts(f, fit)]
             if options:
                 fit = min(options, key=self.order)
         return fit
@@ -185,7 +185,7 @@ class RelativeErrorAcceptance:
                 theta = fit.theta.copy()
                 theta[k] = 0.0
                 less = judge.fit(fit.effects, theta, 12)
-                if self.earns(less, fit):
+                if self.accepts(less, fit):
                     judge.spared.discard(k)
                 else:
                     fit = less
@@ -242,7 +242,7 @@ class RelativeErrorAcceptance:
             same = [m for m in holding if m in alternatives and judge.total_of(alternatives[m]) <= judge.total_of(fit)]
             rivals = [
                 m for m, f in alternatives.items()
-                if m != name and (m in same or (score(judge, f) < mine + RIVAL and self.earns(rest, f)))
+                if m != name and (m in same or (score(judge, f) < mine + RIVAL and self.accepts(rest, f)))
             ]  # fmt: skip
             others = [f for m, f in alternatives.items() if m == name or m not in rivals]
             wins = np.mean(np.argmin([[score(judge, f, d) for d in draws] for f in others], axis=0) == 0)

@@ -25,7 +25,7 @@ __all__ = ["Criterion", "Search"]
 
 
 class Criterion(Protocol):
-    """When an effect is worth its place, and what is said in the end.
+    """When an effect is accepted, and what is reported in the end.
 
     most     effects in one stage
     leaders  effects tried in pairs
@@ -57,8 +57,8 @@ class Criterion(Protocol):
     def fails(self, fit: Fit) -> bool:
         """Whether the model needs anything more."""
 
-    def earns(self, before: Fit, after: Fit) -> bool:
-        """Whether ``after`` is worth the effects that it has more."""
+    def accepts(self, before: Fit, after: Fit) -> bool:
+        """Whether the rules accept the further effects of ``after``."""
 
     def gain(self, before: Fit, after: Fit) -> tuple[float, float]:
         """What ``after`` gains over ``before``, as `Candidate` has it."""
@@ -480,7 +480,7 @@ class Search:
     def pruned(self, fit: Fit) -> Fit:
         """The fit without the effects that it does not need any more."""
         less = lambda f: [self.without(f, drop) for drop in f.effects] if len(f.effects) > 1 else []  # noqa: E731
-        return eliminate(fit, less, self.criterion.earns, lambda idle: min(idle, key=self.criterion.order))
+        return eliminate(fit, less, self.criterion.accepts, lambda idle: min(idle, key=self.criterion.order))
 
     def beside(self, rest: Sequence[str]) -> list[Fit]:
         """Fits made with one effect more than ``rest``."""

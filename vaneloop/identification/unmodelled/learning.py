@@ -1,10 +1,9 @@
 """A law that nobody listed: where it acts, of which quantity it is a function, and its curve.
 
-Every place of the model is tried with every quantity that the logs or the model know. The slopes of a curve's functions
-at the model as it is say what each could do, one linear solve a candidate; the most promising are fitted inside the
-simulation, with the model's own parameters. What earns a curve its place is what earns it for a law with a name
-(`identification.selection.relative_error_acceptance`): the error of blocks that it was not fitted to, and no harm to a
-test log. Beside laws with names it must do clearly better than the best of them.
+Every injection point of the model is tried with every regressor of the logs or the model. Linear screening ranks the
+candidates: one linear solve each, with the derivatives of the residuals by the curve's amplitudes. The leaders are
+fitted inside the simulation, with the model's own parameters. A curve is accepted by the rules for a library term
+(`identification.selection.rules`), and must do clearly better than the best library terms.
 """
 
 from __future__ import annotations
@@ -133,7 +132,7 @@ class CurveSearch(CurveProblem):
     def accepted(self, current: FittedCandidate, tried: Sequence[FittedCandidate]) -> list[FittedCandidate]:
         """Curves that the rules accept, by themselves or by a closed form, and that harm no validation log."""
         self.out.nearest = self.out.nearest or [t.candidate.name for t in tried[:3]]
-        good = [t for t in tried if self._earns(current, t)]
+        good = [t for t in tried if self.allowed(current, t)]
         poor = [t for t in tried if t not in good]
         only_said = earning_by_formula(self, current, poor, tried) if self.speaks else []
         self.by_formula = frozenset(t.candidate.name for t in only_said)
@@ -181,11 +180,11 @@ class CurveSearch(CurveProblem):
         learned, "" if it is: it harms a test log, and no formula that does as well is harmless.
         """
         best = self._settled(current, self._with_its_lag(current, tried, LAG_TIMES[1:]))
-        why = self.harmful(current, best)
+        why = self.objection(current, best)
         if why or self.fails(best):
             best.formulas = fitted_formulas(self.ground, best)
         for _, f in best.formulas or () if why and self.speaks else ():
-            if not self.harmful(current, f) and self.score(f, [f, best]) <= self.score(best, [f, best]) + RIVAL:
+            if not self.objection(current, f) and self.score(f, [f, best]) <= self.score(best, [f, best]) + RIVAL:
                 why = ""
         return best, why
 
@@ -239,14 +238,15 @@ class CurveSearch(CurveProblem):
         """The laws of the library, to hold a candidate against them."""
         return FittedCandidate(candidate, 0.0, judge, fit, (), errors=self.ground.errors((), fit.theta, fit.effects))
 
-    def _earns(self, before: FittedCandidate, tried: FittedCandidate) -> bool:
+    def allowed(self, before: FittedCandidate, tried: FittedCandidate) -> bool:
+        """Whether the rules accept a curve by itself; a hysteresis must dissipate."""
         c = tried.candidate
         if c.quantity.stops:
             table, amplitudes = tried.table()
             share = share_given_back(c.basis.low, c.basis.high, table(amplitudes))
             if not self.decisions.decide([DISSIPATES], share, tried.names, before.names):
                 return False
-        return self.worth(before, tried)
+        return self.accepts(before, tried)
 
     def _with_formulas(self, before: FittedCandidate, good: Sequence[FittedCandidate], left: dict[str, float]) -> None:
         """Where the best curve still fails, or harms a test log, what each may leave with a formula in its place, else
@@ -259,7 +259,7 @@ class CurveSearch(CurveProblem):
         close = [t for t in good if any(c[t.candidate.name] <= c[best.candidate.name] + FORMULAS_WITHIN for c in costs)]
         close += [t for t in at_its_place(before, good) if t not in close]
         first = close
-        if not (self.fails(best) or self.harmful(before, best)):
+        if not (self.fails(best) or self.objection(before, best)):
             first = [t for t in close if strange(t.candidate) < strange(best.candidate)]
         sparest, least = min(len(t.fit.free) for t in (*close, best)), left[best.candidate.name]
         for some in (first, [t for t in close if t not in first]):
@@ -316,7 +316,7 @@ class CurveSearch(CurveProblem):
         """
         if not adds_what(tried.candidate, best.candidate):
             return False
-        if self.worth(tried, best):
+        if self.accepts(tried, best):
             return False
         mine, its = (self.tested(before, t, [tried, best]) for t in (tried, best))
         return mine < its + HARM
@@ -428,7 +428,7 @@ class CurveSearch(CurveProblem):
             home = at_its_place(current, done)
             close = [t for t in done if t in home or self.score(t, done) < best + FORMULAS_WITHIN]
             jumping = [j for j in self.each(lambda t: self._jumping(current, t), close) if j is not None]
-            coarse = [t for t in done if t in finer and self.worth(t, finer[t])]  # a second law would patch them
+            coarse = [t for t in done if t in finer and self.accepts(t, finer[t])]  # a second law would patch them
             done = self.ordered([*(t for t in done if t not in coarse), *finer.values(), *jumping])
             first_of = {t.candidate.name: t for t in reversed(done)}
             done = [t for t in done if first_of[t.candidate.name] is t]

@@ -66,7 +66,7 @@ def earning_by_formula(
     near = [t for t in poor if t in home or learner.score(t, among) < reach]
     near = [t for t in near if not t.candidate.quantity.remembers]
     said = all_in_their_place(learner.ground, near)
-    return [t for t, formulas in zip(near, said, strict=True) if any(learner.worth(before, f) for f in formulas)]
+    return [t for t, formulas in zip(near, said, strict=True) if any(learner.accepts(before, f) for f in formulas)]
 
 
 def harmless(
@@ -76,7 +76,7 @@ def harmless(
 
     left  what orders them, by name
     """
-    fine = [t for t in good if any(not learner.harmful(before, f) for f in (t, *(t.loose or ())))]
+    fine = [t for t in good if any(not learner.objection(before, f) for f in (t, *(t.loose or ())))]
     reach = min(left[t.candidate.name] for t in good) + NOT_INSTEAD
     return fine if any(left[t.candidate.name] < reach for t in fine) else good
 
@@ -88,7 +88,7 @@ def without_memory(
     much.
     """
     plain = [t for t in good if not t.candidate.quantity.remembers]
-    enough = any(not learner.fails(t) and not learner.harmful(before, t) for t in plain)
+    enough = any(not learner.fails(t) and not learner.objection(before, t) for t in plain)
     return plain if enough else good
 
 
@@ -132,5 +132,5 @@ def leaves(tried: FittedCandidate) -> float:
 
 
 def better_than(learner: CurveProblem, before: FittedCandidate, tried: FittedCandidate) -> bool:
-    """Whether a curve, or a formula in its place, earns its place before something else."""
-    return any(learner.worth(before, t) for t in (tried, *(f for _, f in tried.formulas or ())))
+    """Whether a curve, or a closed form in its place, is accepted over something else."""
+    return any(learner.accepts(before, t) for t in (tried, *(f for _, f in tried.formulas or ())))

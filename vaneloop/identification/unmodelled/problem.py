@@ -116,8 +116,8 @@ class CurveProblem:
         """What orders curves: `score`, where all of ``among`` (default: itself) know something."""
         return score(*self.judged(tried, among or [tried]))
 
-    def worth(self, before: FittedCandidate, tried: FittedCandidate) -> bool:
-        """Whether a curve earns its place, where it knows something and what it is held against does."""
+    def accepts(self, before: FittedCandidate, tried: FittedCandidate) -> bool:
+        """Whether the rules accept a curve, on the samples where it and what it is compared with are determined."""
         among = [tried, before] if before.curves else [tried]
         (judge, was), (_, now) = (self.judged(t, among) for t in (before, tried))
         correlation = correlation_of(tried.judge, tried.fit) if self.faint else 1.0
@@ -156,7 +156,7 @@ class CurveProblem:
         fit = with_held_out(judge, judge.fit(names, begin, iterations, slopes=slopes))
         return FittedCandidate(candidate, wiggle, judge, fit, curves)
 
-    def harmful(self, before: FittedCandidate, tried: FittedCandidate) -> str:
+    def objection(self, before: FittedCandidate, tried: FittedCandidate) -> str:
         """Why the logs speak against a curve; "": they do not."""
         logs = LogChanges(self.change(before, tried), self.ground.tests)
         sure = True

@@ -66,7 +66,7 @@ class SurfaceSelection:
         learner, nothing = self.learner, self.nothing
         sums = list(learner.each(lambda t: _sum(learner, nothing, t), tried))
         others = [nothing, *([current] if current is not nothing else []), *sums]
-        return [t for t in tried if all(learner.worth(other, t) for other in others)]
+        return [t for t in tried if all(learner.accepts(other, t) for other in others)]
 
     def chosen(self, current: FittedCandidate, accepted: Sequence[FittedCandidate]) -> FittedCandidate | None:
         """Of those that do as well as the best the preferred one, unless it harms a validation log."""
@@ -79,7 +79,7 @@ class SurfaceSelection:
         least = min(left.values())
         near = [t for t in good if left[t.candidate.name] < least + RIVAL]
         best = min(near, key=lambda t: (*plain(t.candidate), left[t.candidate.name]))
-        why = learner.harmful(current, best)
+        why = learner.objection(current, best)
         if why and not any(_does_as_well(learner, current, best, f) for _, f in best.formulas or ()):
             self.out.notes.append(f"{best.candidate.name} fits, but is not learned: {why}")
             return None
@@ -95,7 +95,7 @@ def _does_as_well(
 ) -> bool:
     """Whether a formula does as well as its surface where that has been learned, and harms no log that goes further."""
     near = learner.score(formula, [formula, surface]) < learner.score(surface, [formula, surface]) + RIVAL
-    return near and not learner.harmful(before, formula)
+    return near and not learner.objection(before, formula)
 
 
 def _candidates(learner: CurveProblem) -> list[SurfaceCandidate]:
