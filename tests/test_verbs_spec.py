@@ -607,6 +607,7 @@ class Says:
     notes: list[str]
     nearest: list[str]
     why: str = "none fits"
+    decisions: tuple[Any, ...] = ()
 
 
 class Learning:
@@ -939,7 +940,7 @@ class Own:
             learned=lambda: self.outcome, judge="judge", base=SimpleNamespace(theta=np.array([7.0]))
         )
         self.by_log = SimpleNamespace(model=Model(meta={"x": 1}), json=dict)
-        self.errors = errors
+        self.errors, self.first = errors, SimpleNamespace(stage="tank")
         for name, said in (
             ("CurveSearch", self.learner), ("UserModelCandidates", "ground"), ("on_logs", "logs on"), ("rms_of", 4.0),
             ("found_of", "found"), ("answer_of", self.answer()),
@@ -953,7 +954,7 @@ class Own:
         logs = SimpleNamespace(fitted=None, test=None)
         self.diagnosed: Any = search.Diagnosed(
             "bound",
-            SimpleNamespace(stages=["first", "second"]),
+            SimpleNamespace(stages=[self.first, "second"]),
             "r.csv",
             SimpleNamespace(logs=logs),  # type: ignore[arg-type]
         )
@@ -979,7 +980,7 @@ class Own:
 def test_laws_of_a_system_are_held_against_its_model_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     own = Own(monkeypatch)
     said = own.learned()
-    assert own.asked["CurveSearch"] == [("ground", "first", own.told.append, ("odd",), False)]
+    assert own.asked["CurveSearch"] == [("ground", own.first, own.told.append, ("odd",), False)]
     assert own.asked["law_of"] == [
         ("ground", ("judge", own.learner.base), "a"), ("ground", (own.judge, "fit of a"), "b"),
     ]  # fmt: skip
