@@ -12,7 +12,7 @@ import pytest
 from hil.logs import Channel, Log
 from tests import rig
 from tests.firmware_on_rig import firmware
-from vaneloop.identification.selection.likelihood_acceptance import correlation_of
+from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.settings import RIVAL_NATS, SCREENED_BEND
 from vaneloop.identification.unmodelled import parametric_preference as by_formula
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas

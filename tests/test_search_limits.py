@@ -15,9 +15,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import settings as settings_of
+from hypothesis import strategies as st
 from scipy.stats import norm
 
-from tests.conftest import ROOT
+from tests.conftest import ROOT, examples
 from vaneloop.identification import regimes as locate
 from vaneloop.identification import results as stage_answer
 from vaneloop.identification import settings, workflow
@@ -110,8 +113,8 @@ def test_an_effect_must_explain_a_seventh_of_the_excess(times: float, beyond: bo
 
 
 @SIDES
-@pytest.mark.parametrize(("blocks", "each", "edge"), [(20, 100_000, 0.01), (20, 100, 3.0 / np.sqrt(4000.0))])
-def test_a_search_begins_one_per_cent_or_three_spreads_above_the_floor(
+@pytest.mark.parametrize(("blocks", "each", "edge"), [(20, 100_000, 0.01), (20, 100, 3.0 * np.sqrt(1.5 / 2000.0))])
+def test_a_search_begins_one_per_cent_or_three_deviations_of_error_and_floor_above_it(
     blocks: int, each: int, edge: float, times: float, beyond: bool
 ) -> None:
     judge = judge_of(blocks, each)
@@ -122,7 +125,7 @@ def test_a_search_begins_one_per_cent_or_three_spreads_above_the_floor(
 def test_a_search_begins_where_one_block_stands_eight_spreads_above_the_floor(times: float, beyond: bool) -> None:
     judge = judge_of(2000, 100)
     errors = np.ones(2000)
-    errors[3] += 0.01 + 8.0 * times / np.sqrt(200.0)
+    errors[3] += 0.01 + 8.0 * times * np.sqrt(1.0 / 200.0 + 1.0 / 200_000.0)
     assert noise_floor._above_floor(judge, fit_of(errors, judge), 1.0) == beyond
 
 
@@ -362,8 +365,9 @@ def first_of_eight_bins_beyond(chance: float, correlation: float) -> Any:
         name="s", t=np.arange(8.0 * n), outputs=("y",), units=("mm",), regimes={"u": np.arange(8.0 * n)},
         regime_units={}, neutral=lambda: np.zeros(1), lost=None,
     )  # fmt: skip
+    white = np.sqrt(squares) * np.where(np.arange(8 * n) % 2, 1.0, -1.0)  # no neighbour is alike
     return SimpleNamespace(
-        stage=stage, valid=np.ones((1, 8 * n), bool), floor=np.ones(1), errors=lambda _: np.sqrt(squares)[None, None],
+        stage=stage, valid=np.ones((1, 8 * n), bool), floor=np.ones(1), errors=lambda _: white[None, None],
         lost=lambda: np.ones((1, 8 * n)), block_start=np.arange(0, 8 * n, 50),
     )  # fmt: skip
 
@@ -385,6 +389,36 @@ def test_two_samples_count_as_one_where_bins_are_judged(
     monkeypatch.setattr(locate, "rms_per_output", lambda *_: np.ones(1))
     said = locate.locate(first_of_eight_bins_beyond(0.01, 2.0 * times), AT_NOTHING)
     assert said.fails == beyond
+
+
+def test_a_level_that_is_noise_everywhere_is_no_matter_of_one_bin() -> None:
+    """A floor of a short log is 5 % low: each bin stands above it, and none above the others."""
+    judge = first_of_eight_bins_beyond(0.5, 1.0)
+    rng = np.random.default_rng(3)
+    e = 1.08 * rng.standard_normal((1, 1, 4000))
+    judge.errors = lambda _: e
+    assert not any(r.significant.any() for r in locate.regimes(judge, AT_NOTHING, 2.0))
+    e[..., :500] *= 1.4  # one bin beyond the others is told all the same
+    assert locate.regimes(judge, AT_NOTHING, 2.0)[0].significant[0]
+
+
+@given(seed=st.integers(0, 10_000), band=st.floats(0.5, 3.0))
+@settings_of(max_examples=examples(30), deadline=None)
+def test_a_steady_condition_is_within_the_band_and_does_not_follow_what_stays_in_it(seed: int, band: float) -> None:
+    rng = np.random.default_rng(seed)
+    values = np.concatenate([rng.uniform(-band, band, 200), 10.0 * np.cumsum(rng.standard_normal(100))])
+    values[rng.integers(1, 300, 5)] = np.nan
+    out = locate.steady(values, band)
+    assert np.nanmax(np.abs(values - out)) <= band * (1.0 + 1e-12)
+    assert np.ptp(out[:200]) <= band and np.isfinite(out).all()
+
+
+def test_rest_is_no_condition_and_motion_is_one_as_before() -> None:
+    rng = np.random.default_rng(2)
+    noise = rng.standard_normal(3000)
+    assert np.ptp(locate.steady(noise, 4.0)) < 1.0  # all of the noise is within the band
+    moving = 100.0 * np.sin(np.arange(3000) / 100.0) + noise
+    assert np.corrcoef(locate.steady(moving, 4.0), moving)[0, 1] > 0.99
 
 
 @SIDES

@@ -12,14 +12,16 @@ from typing import Any
 import numpy as np
 import scipy
 
+from vaneloop.base.compiled import compiled
+from vaneloop.identification.least_squares.noise import colour_of, tolerance
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
 from vaneloop.identification.results import rms_per_output
-from vaneloop.identification.settings import AGREES, CORRELATION, NOISE_KNOWN_TO, REGIME_BINS, REGIME_LEVEL
+from vaneloop.identification.settings import AGREES, COLOUR, NOISE_KNOWN_TO, REGIME_BINS, REGIME_LEVEL
 from vaneloop.identification.subsystem import Array, without_jumps
 
 __all__ = [
     "Located", "Regime", "Shape", "StageFigures", "agrees", "locate", "onset", "regimes", "shape",
-    "stands_out",
+    "stands_out", "steady",
 ]  # fmt: skip
 
 
@@ -34,6 +36,7 @@ class StageFigures:
 
     rms           with the stage's nominal parameters refitted within their tolerances
     rms_as_given  with the parameters as they are
+    tolerance     error, in noise floors, that is no more than noise: the more, the shorter the log
     """
 
     stage: str
@@ -43,6 +46,7 @@ class StageFigures:
     rms_as_given: float
     noise_floor: float
     samples: int
+    tolerance: float = AGREES
 
     @property
     def ratio(self) -> float:
@@ -52,7 +56,7 @@ class StageFigures:
     @property
     def agrees(self) -> bool:
         """Whether the error is no more than noise."""
-        return agrees(self.rms, self.noise_floor)
+        return bool(self.rms <= self.tolerance * self.noise_floor)
 
     def json(self) -> dict[str, Any]:
         """The figures as the commands' JSON."""
@@ -167,22 +171,49 @@ class Located:
         }  # fmt: skip
 
 
+@compiled
+def steady(values: np.ndarray, band: float) -> np.ndarray:
+    """A condition's values without what is within ``band`` to each side: it moves when the channel leaves the band.
+
+    A condition that holds its own noise sorts the samples by it: at rest the outer bins hold the largest errors of
+    every subsystem that this noise is in, and a model without fault fails there. NaN moves nothing.
+    """
+    out = np.empty(len(values))
+    at = np.nan
+    for i in range(len(values)):
+        v = values[i]
+        if np.isnan(at):
+            at = v
+        elif not np.isnan(v):
+            at = min(max(at, v - band), v + band)
+        out[i] = at
+    return out
+
+
 def locate(judge: LeastSquaresProblem, fit: Fit | None = None) -> Located:
     """Where the stage fails with nothing added. ``fit``: its nominal parameters refitted, where that has been done
     (`recalibrate`).
     """
     stage = judge.stage
     fit = fit or recalibrate(judge)
+    colour = colour_of(judge, fit)
     given = judge.errors(stage.neutral()[None])[0]
     rms, n = rms_per_output(judge, fit), judge.valid.sum(axis=1)
     as_given = np.sqrt(np.sum(given * given, axis=1) / np.maximum(n, 1)) * judge.floor
     signals = tuple(
         StageFigures(
-            stage.name, signal, stage.units[k], float(rms[k]), float(as_given[k]), float(judge.floor[k]), int(n[k])
-        )
+            stage.name,
+            signal,
+            stage.units[k],
+            float(rms[k]),
+            float(as_given[k]),
+            float(judge.floor[k]),
+            int(n[k]),
+            tolerance(int(n[k]), colour),
+        )  # fmt: skip
         for k, signal in enumerate(stage.outputs)
     )
-    found = tuple(regimes(judge, fit, CORRELATION))
+    found = tuple(regimes(judge, fit, colour))
     start = onset(judge, fit) if any(r.significant.any() for r in found) else None
     return Located(stage.name, fit, judge.floor, signals, found, start)
 
@@ -231,15 +262,20 @@ def regimes(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> list[Re
             raw.append((k, output, name, edges, (n, square, floor), moments))
     out = []
     for k, output, name, edges, sums, moments in raw:
-        hot, n, ms = stands_out(*sums, known, looks, correlation)
+        # what is no more than noise everywhere else is no matter of this bin
+        total, squares, expected = (v.sum() - v.sum(axis=1) for v in sums)
+        elsewhere = squares / np.maximum(np.maximum(expected, total), 1.0)
+        noise = elsewhere <= tolerance(int(sums[0].sum()), correlation) ** 2
+        of_noise = np.where(noise, np.maximum(known, elsewhere), known)
+        hot, n, ms = stands_out(*sums, of_noise, looks, correlation)
         ratio = np.sqrt(ms)
         excess = np.maximum(ms - 1.0, 0.0)
         share = excess / excess.sum() if excess.sum() > 0 else np.full(len(n), 1.0 / len(n))
         contrast = float((np.sum(share**2) - 1.0 / len(n)) / (1.0 - 1.0 / len(n))) if len(n) > 1 else 0.0
-        floor = judge.floor[k]
+        unit = judge.floor[k]
         out.append(
             Regime(
-                output, stage.units[k], name, stage.regime_units.get(name, ""), edges, ratio * floor, ratio, n,
+                output, stage.units[k], name, stage.regime_units.get(name, ""), edges, ratio * unit, ratio, n,
                 hot & (ratio > 1.05), contrast, moments,
             )
         )  # fmt: skip
@@ -248,13 +284,13 @@ def regimes(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> list[Re
 
 
 def stands_out(
-    n: Array, square: Array, floor: Array, known: float, looks: int, correlation: float = CORRELATION
+    n: Array, square: Array, floor: Array, known: float | Array, looks: int, correlation: float = COLOUR[0]
 ) -> tuple[Array, Array, Array]:
     """Bins whose error exceeds the noise, corrected for the number of ``looks``, with and without their worst block;
     samples of each bin, and their mean square error over what is to be expected.
 
     n, square, floor  samples, sum of squares in noise floors, and the sum to be expected, each float64[bins, blocks]
-    known             mean square up to which an error may be noise, in squared noise floors
+    known             mean square up to which an error may be noise, in squared noise floors; of each bin, or of all
     """
     worst = (np.arange(len(n)), np.argmax(square - floor, axis=1))
     whole = _mean(*(x.sum(axis=1) for x in (n, square, floor)))

@@ -502,17 +502,23 @@ AGREES = setting(
     "An error of up to so many counts as noise.",
     "principle: floors are known to some per cent; hil/figures.py has the same number",
 )
-CORRELATION = setting(
-    2.0,
+COLOUR = setting(
+    (2.0, 5.0),
     "samples",
-    "So many count as one where errors are looked at bin by bin.",
-    "benchmark: the most that clean logs show",
+    "Of noise at least, and at most, so many samples count as one.",
+    "benchmark: what clean logs show of any subsystem",
 )
 REGIME_BINS = setting(
     8,
     "bins",
     "The residuals are divided by a condition into so many of equal population.",
     "judgement: as fine as a log of a minute allows",
+)
+CONDITION_BAND = setting(
+    4.0,
+    "standard deviations",
+    "A condition moves when its channel leaves a band of so many standard deviations of its noise to each side.",
+    "principle: noise alone leaves it once in 16,000 samples",
 )
 REGIME_LEVEL = setting(
     0.01,

@@ -12,16 +12,12 @@ from typing import Any
 import numpy as np
 
 from vaneloop.base.side_by_side import forks, in_processes
+from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
 from vaneloop.identification.regimes import Located, Shape, StageFigures, agrees, locate, shape
 from vaneloop.identification.results import StageDiagnosis, parameters_of, recalibrated, rms_per_output, weigh
 from vaneloop.identification.selection.diagnosis import Judged, diagnose_stage, extend_stage, floor_of
-from vaneloop.identification.selection.likelihood_acceptance import (
-    LikelihoodAcceptance,
-    as_close,
-    correlation_of,
-    significant,
-)
+from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, as_close, significant
 from vaneloop.identification.selection.rules import decisions_json
 from vaneloop.identification.settings import LOOK_EVERY, NATS, SHORT_SEARCH, SIZES_AGREE, USUAL_FITS
 from vaneloop.identification.subsystem import Stage, StageError

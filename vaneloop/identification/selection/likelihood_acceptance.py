@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vaneloop.identification.least_squares.noise import correlation_of, floor_deviation
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import (
     Candidate,
@@ -54,34 +55,10 @@ if TYPE_CHECKING:
     from vaneloop.identification.selection.search import Search
 
 __all__ = [
-    "LikelihoodAcceptance", "as_close", "correlation_of", "rival_nats", "significant", "with_rivals",
+    "LikelihoodAcceptance", "as_close", "rival_nats", "significant", "with_rivals",
 ]  # fmt: skip
 
 BOUND = "fits only at the end of its physical range"
-
-
-def correlation_of(judge: LeastSquaresProblem, fit: Fit) -> float:
-    """Return how many samples of the fit's error count as one observation, at most 50.
-
-    Variance inflation of a sum of the squared errors: 1 + 2 sum of the squared autocorrelations up to the first that is
-    not positive.
-    """
-    e = judge.errors(fit.theta[None])[0]
-    worst = 1.0
-    for row in e:
-        row = row - row.mean()
-        power = float(row @ row)
-        if power <= 0.0:
-            continue
-        total = 1.0
-        lags = min(400, len(row) // 4)
-        spectrum = np.fft.rfft(row, 1 << (len(row) + lags).bit_length())  # of two, or a prime length takes ten times
-        for rho in np.fft.irfft(np.abs(spectrum) ** 2)[1:lags] / power:
-            if rho <= 0.05:
-                break
-            total += 2.0 * rho * rho  # squares of errors are correlated by rho squared
-        worst = max(worst, total)
-    return min(worst, 50.0)
 
 
 def _above_floor(judge: LeastSquaresProblem, fit: Fit, correlation: float, known: float = FLOOR_KNOWN) -> bool:
@@ -91,9 +68,10 @@ def _above_floor(judge: LeastSquaresProblem, fit: Fit, correlation: float, known
     known  relative error of the noise floor
     """
     n, m = max(judge.n, 1), np.maximum(judge.samples, 1)
-    whole = np.sqrt(max(fit.held_out.sum(), 0.0) / n) > 1.0 + max(SPREADS * np.sqrt(correlation / (2.0 * n)), known)
+    spread = SPREADS * floor_deviation(n, n, correlation)
+    whole = np.sqrt(max(fit.held_out.sum(), 0.0) / n) > 1.0 + max(float(spread), known)
     errors = np.sqrt(np.maximum(fit.held_out, 0.0) / m / judge.expected())
-    blocks = errors > 1.0 + known + BLOCK_SPREADS * np.sqrt(correlation / (2.0 * m))
+    blocks = errors > 1.0 + known + BLOCK_SPREADS * floor_deviation(m, n, correlation)
     return bool(whole or np.any(blocks & (m > 0.2 * m.max())))
 
 

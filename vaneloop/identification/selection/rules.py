@@ -25,6 +25,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from vaneloop.identification.least_squares.noise import floor_deviation
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.settings import (
     AGREE,
@@ -448,7 +449,8 @@ class Remainder:
     @property
     def is_noise(self) -> bool:
         """Whether what is left is noise, as well as its level is known."""
-        return bool(self.after <= max(TOLERATED, 1.0 + SPREADS * np.sqrt(self.correlation / (2.0 * self.n))))
+        spread = SPREADS * float(floor_deviation(self.n, self.n, self.correlation))
+        return self.after <= max(TOLERATED, 1.0 + spread)
 
 
 EXPLAINS_HALF = Rule[Remainder](

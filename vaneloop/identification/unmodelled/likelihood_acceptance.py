@@ -12,8 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
-from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, correlation_of, rival_nats
+from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, rival_nats
 from vaneloop.identification.settings import NATS, RIVAL
 from vaneloop.identification.unmodelled.fitted_candidate import CandidateSource
 

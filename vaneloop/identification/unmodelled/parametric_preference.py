@@ -10,8 +10,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from vaneloop.base.side_by_side import side_by_side
+from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.results import rms_of
-from vaneloop.identification.selection.likelihood_acceptance import correlation_of, rival_nats
+from vaneloop.identification.selection.likelihood_acceptance import rival_nats
 from vaneloop.identification.settings import FORMULA_MAY_EARN, MOST_LEFT, NOT_INSTEAD
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
 from vaneloop.identification.unmodelled.fitted_candidate import MEASURED, CandidateSource, FittedCandidate, strange

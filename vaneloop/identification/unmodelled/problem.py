@@ -9,9 +9,9 @@ import numpy as np
 
 from vaneloop.base.side_by_side import Answer, Item, side_by_side
 from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known
+from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import StageDiagnosis
-from vaneloop.identification.selection.likelihood_acceptance import correlation_of
 from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance, score
 from vaneloop.identification.selection.rules import (
     EXCESS,

@@ -10,7 +10,9 @@ import numpy as np
 import scipy
 
 from vaneloop.base.sizes import LARGEST, beyond, no_smaller
+from vaneloop.identification.regimes import steady
 from vaneloop.identification.settings import (
+    CONDITION_BAND,
     EDGE_PERIODS,
     INPUT_JUMP,
     LONGEST_SPIKE,
@@ -283,6 +285,8 @@ class Data:
             y = self.measured[i]
             if o not in out and np.isfinite(y).any():
                 out[o], units[o] = np.where(np.isfinite(y), y, np.nanmean(y)), s.outputs[o]
+        if s.kind != "static":  # rows of a static model may be in any order
+            out = {n: v if n == "time" else steady(v, CONDITION_BAND * noise_of_channel(v)) for n, v in out.items()}
         if len(self.records) > 1:
             out["log"] = np.concatenate([np.full(len(r.t), float(k + 1)) for k, r in enumerate(self.records)])
             units["log"] = ""

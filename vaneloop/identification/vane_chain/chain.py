@@ -223,6 +223,9 @@ def build_chain(
         if np.isfinite(stage.measured).sum() < 300:
             absent[name] = "fewer than 300 samples in mode RUN without gaps"
             continue
+        if all(_never_changes(v) for v in (*(columns[c] for c in needs), *stage.measured)):
+            absent[name] = f"{', '.join((*needs, *outputs))} never change"
+            continue
         if dt > 1.5 * RASTER:
             # a corner of an input between two rows costs about as much as the corners that the doubled raster loses
             # besides
@@ -243,6 +246,12 @@ def build_chain(
         stage.floor = noise_of(stage, stage.neutral())
         stages.append(stage)
     return Chain(t, stages, absent, columns, machine, tables, cal, notes, steps)
+
+
+def _never_changes(values: Array) -> bool:
+    """Whether all values are the same to the last bit: a sensor's noise would change them."""
+    known = values[np.isfinite(values)]
+    return bool(np.all(known == known[:1]))
 
 
 def _lost_step(log: Log, machine: Plant) -> float:

@@ -15,9 +15,10 @@ from hil.logs import Channel, Log
 from hil.loop.lockstep import Stimulus, lockstep
 from plant import Model, build_plant
 from plant.effects import EFFECTS
+from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import floor_of
-from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, correlation_of
+from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
 from vaneloop.identification.selection.rules import gain
 from vaneloop.identification.selection.search import Search
 from vaneloop.identification.settings import MARGIN, MOST_REPEATS, NATS, RIVAL_SPREADS

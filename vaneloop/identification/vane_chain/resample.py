@@ -10,11 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hil.figures import noise_floor
 from hil.logs import Channel, Log, LogError
 from hil.logs.held import COMMANDS, answers, held, taken
 from vaneloop.base.compiled import compiled
 from vaneloop.base.sizes import no_smaller
-from vaneloop.identification.settings import RASTER, WINDOW
+from vaneloop.identification.regimes import steady
+from vaneloop.identification.settings import CONDITION_BAND, RASTER, WINDOW
 from vaneloop.identification.subsystem import Array, Stage
 
 __all__ = [
@@ -30,6 +32,9 @@ __all__ = [
     "since",
     "stretches",
 ]
+
+
+CONDITIONS = ("x_lvdt", "n_r", "t_oil", "p_s", "i_cmd")
 
 
 class Grid(NamedTuple):
@@ -214,7 +219,8 @@ def lately(rows: Array, seconds: float, dt: float = RASTER) -> Array:
 
 
 def regimes_of(t: Array, columns: dict[str, Array]) -> tuple[dict[str, Array], dict[str, str]]:
-    """Conditions under which a stage may fail."""
+    """Conditions under which a stage may fail, each without its sensor's noise (`steady`)."""
+    columns = {c: steady(v, CONDITION_BAND * noise_floor(t, v)) for c, v in columns.items() if c in CONDITIONS}
     out: dict[str, Array] = {"time": t}
     units = {"time": "s"}
     dt = t[1] - t[0]
