@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,6 +22,7 @@ from vaneloop.identification.least_squares.problem import Fit
 from vaneloop.identification.selection import rules
 from vaneloop.identification.selection.rules import RULES, Comparison, Decision, Decisions, LogChanges, Remainder
 from vaneloop.identification.selection.stepwise import eliminate, stepwise
+from vaneloop.identification.subsystem import Parameter
 from vaneloop.pages.decisions import decision_table, explain, reasons
 from vaneloop.pages.page import Page
 from vaneloop.verbs.learn import learn
@@ -208,3 +210,19 @@ def test_explain_prints_every_decision_and_the_reason_of_every_rule(
     args.explain = False
     command.show(args, answer.explained)
     assert capsys.readouterr().out == ""
+
+
+@given(value=st.floats(-2.0, 2.0), low=st.floats(0.01, 1.0), high=st.floats(0.01, 1.0))
+@settings_of(max_examples=examples(50), deadline=None)
+def test_an_effect_whose_interval_holds_its_neutral_size_is_not_there(value: float, low: float, high: float) -> None:
+    """The size, not the shape: where a knee lies says nothing of whether it is there."""
+    c = comparison([40.0] * BLOCKS, [1.0] * BLOCKS)
+    sizes = (Parameter("size", 0.5, "1"), Parameter("knee", 0.0, "1", shape=True))
+    c.judge.stage = SimpleNamespace(
+        index=lambda: {"e": slice(0, 2)}, effect=lambda _: SimpleNamespace(parameters=sizes)
+    )
+    theta = np.array([value, 0.0])
+    ends = np.array([value - low, -1.0]), np.array([value + high, 1.0])
+    after = replace(c.after, effects=("e",), theta=theta, free=np.arange(2), low=ends[0], high=ends[1])
+    verdict = rules.AWAY.verdict(replace(c, after=after))
+    assert verdict.holds == (not value - low < 0.5 < value + high) or abs(verdict.value - 1.0) < 1e-9

@@ -239,7 +239,8 @@ def test_the_five_leaders_are_tried_in_pairs_and_no_more_than_four_effects_are_t
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     effects = tuple(Effect(c, (Parameter("size", 0.0, "1"),), ((1.0,),)) for c in "abcdefgh")
-    stage: Any = SimpleNamespace(effects=effects, effect=lambda n: None)
+    starts = lambda: dict.fromkeys("abcdefgh", slice(0, 1))  # noqa: E731
+    stage: Any = SimpleNamespace(effects=effects, effect=lambda n: SimpleNamespace(parameters=()), index=starts)
     judge = judge_of(20, 100)
     judge.stage = stage
     monkeypatch.setattr(noise_floor, "correlation_of", lambda *_: 1.0)

@@ -29,6 +29,7 @@ from vaneloop.identification.results import (
     rms_per_output,
 )
 from vaneloop.identification.selection.rules import (
+    AWAY,
     EXPLAINS_HALF,
     KNOWN_NOISE,
     LEAVES_LITTLE,
@@ -112,7 +113,7 @@ class LikelihoodAcceptance:
         if after is before:
             return False
         case = Comparison(self.judge, before, after, self.correlation)
-        return self.decisions.decide(KNOWN_NOISE, case, after.effects, before.effects)
+        return self.decisions.decide((*KNOWN_NOISE, AWAY), case, after.effects, before.effects)
 
     def gain(self, before: Fit, after: Fit) -> tuple[float, float]:
         """Nats and spreads."""

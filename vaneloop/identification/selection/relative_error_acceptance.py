@@ -21,6 +21,8 @@ from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProbl
 from vaneloop.identification.regimes import agrees
 from vaneloop.identification.results import Candidate, Found, StageDiagnosis, answer_of, at_bound, parameters_of, rms_of
 from vaneloop.identification.selection.rules import (
+    AWAY,
+    HARMS_NONE,
     LEAVES_A_QUARTER,
     OTHER_LOGS,
     UNKNOWN_NOISE,
@@ -103,7 +105,7 @@ class RelativeErrorAcceptance:
         if after is before:
             return False
         case = Comparison(self.judge, before, after, form=self.form)
-        return self.decisions.decide(UNKNOWN_NOISE, case, after.effects, before.effects)
+        return self.decisions.decide((*UNKNOWN_NOISE, AWAY), case, after.effects, before.effects)
 
     def gain(self, before: Fit, after: Fit) -> tuple[float, float]:
         """Per cent of the held-out error; share of the change that is improvement."""
@@ -172,7 +174,23 @@ class RelativeErrorAcceptance:
                 break
             else:
                 break
-        return fit
+        return self._harmless_together(search, fit)
+
+    def _harmless_together(self, search: Search, fit: Fit) -> Fit:
+        """The model without any effect where all of them together make a log worse: taken out one at a time, each may
+        look needed to make up for another.
+        """
+        if self.figures is None or not fit.effects:
+            return fit
+        base, with_them = self.figures(search.base.theta), self.figures(fit.theta)
+        change = {log: with_them[log] - v for log, v in base.items() if log in with_them}
+        case = LogChanges(change, frozenset(change))
+        if self.decisions.decide([HARMS_NONE], case, fit.effects, ()):
+            return fit
+        named = " + ".join(fit.effects)
+        self.left_out |= dict.fromkeys(fit.effects, case.objection())
+        self.notes.append(f"{named} fits, but is not named: {case.objection()}")
+        return search.base
 
     def spared(self, fit: Fit) -> Fit:
         """Set to zero what the model itself does not need any more: coefficients not below 0 that only stood in for

@@ -8,6 +8,7 @@ A number that is not finite never meets a limit.
 |---|---|---|
 | `KNOWN_NOISE` | effects and curves of a model that may come down to the noise of its log | `Comparison` |
 | `UNKNOWN_NOISE` | effects and curves of a model that will not | `Comparison` |
+| `AWAY` | effects of the library, on top of these | `Comparison` |
 | `NEAR_NOISE` | curves where the error is hardly more than noise | `AllRows` |
 | `DISSIPATES`, `CONFIRMED` | curves of hysteretic and dynamic terms | a number, `Confirmation` |
 | `OTHER_LOGS` | what was accepted, on each log | `LogChanges` |
@@ -51,9 +52,10 @@ from vaneloop.identification.settings import (
 from vaneloop.identification.subsystem import Array
 
 __all__ = [
-    "CONFIRMED", "DISSIPATES", "EXCESS", "EXPLAINS_HALF", "GAIN", "KNOWN_NOISE", "LEAVES_A_QUARTER", "LEAVES_LITTLE",
-    "NAMED", "NEAR_NOISE", "OTHER_LOGS", "RULES", "UNKNOWN_NOISE", "AllRows", "Comparison", "Confirmation", "Decision",
-    "Decisions", "LogChanges", "Naming", "Remainder", "Rule", "Verdict", "decisions_json", "gain",
+    "AWAY", "CONFIRMED", "DISSIPATES", "EXCESS", "EXPLAINS_HALF", "GAIN", "HARMS_NONE", "KNOWN_NOISE",
+    "LEAVES_A_QUARTER", "LEAVES_LITTLE", "NAMED", "NEAR_NOISE", "OTHER_LOGS", "RULES", "UNKNOWN_NOISE", "AllRows",
+    "Comparison", "Confirmation", "Decision", "Decisions", "LogChanges", "Naming", "Remainder", "Rule", "Verdict",
+    "decisions_json", "gain",
 ]  # fmt: skip
 
 Case = TypeVar("Case")
@@ -201,6 +203,26 @@ class Comparison:
         change = float(np.abs(self.block_changes).sum())
         return float(np.maximum(self.block_changes, 0.0).sum()) / change if change > 0 else 0.0
 
+    @property
+    def away_from_neutral(self) -> float:
+        """Of the further effect that is nearest to neutral: distance of its clearest size from there, over that of the
+        near end of its 90 % interval from the size; above 1 the interval excludes neutral. Infinite without any.
+        """
+        further = [e for e in self.after.effects if e not in self.before.effects]
+        return min((self._clearest(e) for e in further), default=np.inf)
+
+    def _clearest(self, effect: str) -> float:
+        stage, fit, found = self.judge.stage, self.after, []
+        at = stage.index()[effect].start
+        for i, p in enumerate(stage.effect(effect).parameters):
+            if p.shape:
+                continue
+            k = int(np.flatnonzero(fit.free == at + i)[0])
+            value, neutral = float(fit.theta[at + i]), p.value
+            half = value - float(fit.low[k]) if neutral < value else float(fit.high[k]) - value
+            found.append(abs(value - neutral) / half if half > 0.0 else np.inf * abs(value - neutral))
+        return max(found, default=np.inf)
+
     def _levels(self, fit: Fit, least: float = 1.0) -> Array:
         """Held-out sum of squares of every block, not below ``least`` (noise floors, RMS)."""
         use = self.judge.samples > 0
@@ -243,6 +265,11 @@ DEVIATIONS = Rule[Comparison](
     lambda c: c.gain[1], lambda _: SPREADS,
 )  # fmt: skip
 KNOWN_NOISE = (EXCESS, GAIN, DEVIATIONS)
+AWAY = Rule[Comparison](
+    "away from neutral", "interval half-widths",
+    "An effect whose own interval holds the size at which it does nothing is not there.",
+    lambda c: c.away_from_neutral, lambda _: 1.0,
+)  # fmt: skip
 
 UNKNOWN_NOISE = (
     Rule[Comparison](
@@ -481,7 +508,7 @@ LEAVES_A_QUARTER = Rule[Remainder](
 RULES: dict[str, Rule[Any]] = {
     rule.name: rule
     for rule in (
-        *KNOWN_NOISE, *UNKNOWN_NOISE, *NEAR_NOISE, DISSIPATES, CONFIRMED, *OTHER_LOGS, *NAMED, EXPLAINS_HALF,
+        *KNOWN_NOISE, *UNKNOWN_NOISE, AWAY, *NEAR_NOISE, DISSIPATES, CONFIRMED, *OTHER_LOGS, *NAMED, EXPLAINS_HALF,
         *LEAVES_LITTLE, LEAVES_A_QUARTER,
     )
 }  # fmt: skip
