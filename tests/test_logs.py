@@ -27,6 +27,7 @@ from hil.logs.candump import read_candump
 from hil.logs.dbc import Message, load_dbc
 from hil.logs.formats import FORMATS
 from hil.logs.frames import EXTENDED, Frames
+from hil.logs.notes import Note
 from hil.logs.signals import cut_signal, e2e_crc, encode, select
 from hil.logs.trc import read_trc
 from tests.conftest import examples
@@ -675,13 +676,17 @@ def test_parquet_takes_integers_bools_dates_and_nulls(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("quote", ["", '"'])
-def test_rows_of_a_csv_with_too_few_or_too_many_cells_keep_their_place(tmp_path: Path, quote: str) -> None:
-    """As a logger leaves them that lost its power, or that added a remark: nothing is moved, nothing else is lost."""
+def test_rows_of_a_csv_with_too_few_or_too_many_cells_are_left_out_and_told(tmp_path: Path, quote: str) -> None:
+    """As a logger leaves them that lost its power, or that added a list: nothing is moved, filled or cut."""
     rows = ["0,1,5", "1,2", "2,3,7,a remark", "", f"4,{quote}5{quote},9", "5,6,1", "6"]
     log = read_log(csv(tmp_path, "t,n_dem,n_r\n" + "\n".join(rows)))
-    assert log.channels["n_dem"].t.tolist() == [0, 1, 2, 4, 5]
-    assert log.channels["n_dem"].values.tolist() == [1, 2, 3, 5, 6]
-    assert log.channels["n_r"].t.tolist() == [0, 2, 4, 5] and log.channels["n_r"].values.tolist() == [5, 7, 9, 1]
+    for name, values in (("n_dem", [1, 5, 6]), ("n_r", [5, 9, 1])):
+        assert log.channels[name].t.tolist() == [0, 4, 5] and log.channels[name].values.tolist() == values
+    (note,) = log.notes
+    assert note == (
+        "rows: 3 of 7 rows have more or fewer cells than the header (first row 3: 2, the header 3): left out"
+    )
+    assert isinstance(note, Note) and note.count == 3 and note.rows == (3, 4, 8)
     assert "row 6: 'x' is not a number" in refused(csv(tmp_path, "t,n_dem\n0,1\n1\n\n2,3\n3,x\n"))
 
 
@@ -768,8 +773,8 @@ def test_a_word_among_numbers_is_named_by_its_row(tmp_path: Path) -> None:
         "t\tn_dem\n0\t1.5\n0.5\t2.5\n", '"t","n_dem"\n"0","1.5"\n"0.5","2.5"\n',
         "t,n_dem\r\n0,1.5\r\n0.5,2.5\r\n",
         " t , n_dem \n 0 , 1.5 \n 0.5, 2.5\n", "\ufefft,n_dem\n0,1.5\n0.5,2.5",
-        "t,n_dem,note\n0,1.5,a\n0.5,2.5,b,c\n", "note,t,n_dem\n\u00e4,0,1.5\n-,0.5,2.5\n",
-        "t,n_dem,x_dem\n0,1.5\n0.5,2.5,\n", "t,n_dem\n0,+1.5\n5e-1,25e-1\n",
+        "t,n_dem,note\n0,1.5,a\n0.5,2.5\n", "note,t,n_dem\n\u00e4,0,1.5\n-,0.5,2.5\n",
+        "t,n_dem,x_dem\n0,1.5,\n0.5,2.5,,\n", "t,n_dem\n0,+1.5\n5e-1,25e-1\n",
     ],
 )  # fmt: skip
 def test_csv_dialects(tmp_path: Path, text: str) -> None:

@@ -209,7 +209,7 @@ def test_a_suffix_that_lies_is_refused(tmp_path: Path) -> None:
         good[suffix] = (tmp_path / f"a{suffix}").read_bytes()
     for suffix in FORMATS:
         for other, raw in good.items():
-            if other != suffix:
+            if other != suffix and not (FORMATS[other].source and FORMATS[other].source == FORMATS[suffix].source):
                 (tmp_path / f"b{suffix}").write_bytes(raw)
                 with pytest.raises(LogError):
                     read_log(tmp_path / f"b{suffix}")

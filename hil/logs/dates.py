@@ -9,9 +9,10 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import compute as pc
 
+from hil.logs.notes import Note
 from hil.logs.source import ABSENT, numbers
 
-__all__ = ["OddRow", "from_dates"]
+__all__ = ["Dates", "OddRow", "date_notes", "from_dates"]
 
 # days as loggers write them, and the clock; a decimal comma has become a point, Z has become +00:00
 _Y, _M, _D, _SHORT = r"(?P<y>\d{4})", r"(?P<m>\d{1,2})", r"(?P<d>\d{1,2})", r"(?P<y>\d{2})"
@@ -25,6 +26,9 @@ _DAYS = (
 _CLOCK = r"(?P<H>\d{1,2}):(?P<M>\d{2})(?::(?P<S>\d{2})(?P<f>\.\d+)?)?"
 _ZONE = r"(?: *(?P<zh>[+-]\d{2}):?(?P<zm>\d{2}))?"
 _FEW = 1000  # rows that most forms of another kind are told by
+_HOUR, _DAY = 3_600_000_000, 86_400_000_000  # microseconds
+_PAUSE = 60_000_000  # microseconds that pass at most between the two rows at the end of summer time
+_NIGHT = 4  # clocks are put back to an hour before
 _NO_ZONE = 100  # hours that two digits cannot say
 
 
@@ -35,12 +39,28 @@ class OddRow(NamedTuple):
     why: str
 
 
-def from_dates(text: Any) -> tuple[np.ndarray, str] | OddRow | None:
-    """Seconds of Arrow's strings of dates or times of day (null: no sample), counted from the first, and a note; the
-    first cell that is none, where those before it are dates; None where they are none.
+class Dates(NamedTuple):
+    """Times that were words.
 
-    The form is one that all rows have. A time of day that falls back by more than half a day has passed midnight. Day,
-    month and short year that no row tells apart do not matter within one day; beyond it such dates are refused (None).
+    t     s from the first one, `ABSENT` where there is none
+    zero  the first one, microseconds since 1970 or midnight
+    note  what is the start of the log
+    back  place in the column, from 0, where the hour of the end of summer time was taken out; -1: nowhere
+    """
+
+    t: np.ndarray
+    zero: int
+    note: str
+    back: int = -1
+
+
+def from_dates(text: Any) -> Dates | OddRow | None:
+    """Times of Arrow's strings of dates or times of day (null: no sample); the first cell that is none, where those
+    before it are dates; None where they are none.
+
+    The form is one that all rows have. A time of day that falls back by more than half a day has passed midnight. Local
+    time that falls back by an hour once, at night, is that of the end of summer time: the hour is taken out. Day, month
+    and short year that no row tells apart do not matter within one day; beyond it such dates are refused (None).
     """
     known = np.asarray([v is not None for v in text.to_pylist()], bool)
     cells = text.drop_null()
@@ -62,11 +82,36 @@ def from_dates(text: Any) -> tuple[np.ndarray, str] | OddRow | None:
         return OddRow(int(np.flatnonzero(known)[furthest]), why) if furthest else None
     day, us = next(iter(read.items()))
     if not day:
-        us = us + 86_400_000_000 * np.cumsum(np.diff(us, prepend=us[0]) < -43_200_000_000)
-        return _since(us, known), f"time: of day; {there[0]} taken for the start of the log"
+        us = us + _DAY * np.cumsum(np.diff(us, prepend=us[0]) < -_DAY // 2)
     if sum(d in _AMBIGUOUS for d in read) > 1 and day in _AMBIGUOUS and np.unique(us // 86_400_000_000).size > 1:
         return None
-    return _since(us, known), f"time: dates; {there[0]} taken for the start of the log"
+    note = f"time: {'dates' if day else 'of day'}; {there[0]} taken for the start of the log"
+    back = -1
+    if not re.search(r":\d{2}(?:\.\d+)? *[+-]\d{2}:?\d{2}$", str(there[0])) and (at := _summer_ends(us)):
+        us[at:] += _HOUR
+        back = int(np.flatnonzero(known)[at])
+    return Dates(_since(us, known), int(us[0]), note, back)
+
+
+def date_notes(found: Dates, first: int) -> list[str]:
+    """Notes on dates in a column whose first row is called ``first``."""
+    if found.back < 0:
+        return [found.note]
+    row = first + found.back
+    said = f"time: falls back by an hour at row {row}, at the end of summer time: the hour is taken out from there on"
+    return [found.note, Note(said, "converted", "time", len(found.t) - found.back, [row])]
+
+
+def _summer_ends(us: np.ndarray) -> int:
+    """Place at which local time (microseconds) falls back by an hour, the only time and at night; 0 where it does
+    not.
+    """
+    falls = np.flatnonzero(np.diff(us) < 0) + 1
+    if falls.size != 1:
+        return 0
+    at = int(falls[0])
+    fall, hour = us[at - 1] - us[at], us[at] % _DAY // _HOUR
+    return at if _HOUR - _PAUSE <= fall <= _HOUR and hour < _NIGHT else 0
 
 
 def _parsed(text: Any, form: str) -> np.ndarray | int:

@@ -169,11 +169,20 @@ OURS = (
         recorder="hil.logs.mdf_write:MdfRecord", recording="hil.logs.mdf:read_record_mdf",
     ),
     Format(
-        "CSV", (".csv",), "one header line, perhaps a row of units below it; `,` `;` or tab; decimal comma with `;`; "
-        "before it lines that begin with `#`",
+        "CSV", (".csv",), "a header, perhaps a row of units below it and other lines before it; `,` `;` or tab; "
+        "decimal point or comma; a time for all columns or one for each",
         names="columns",
         source="hil.logs.csv_format:open_csv", channels="hil.logs.csv_format:write_csv",
         recording="hil.logs.recordings:read_text",
+    ),
+    Format(
+        "Megasquirt log", (".msl",), "as written by TunerStudio and MegaLogViewer: a CSV with tabs",
+        names="columns", source="hil.logs.csv_format:open_csv", channels="hil.logs.csv_format:write_msl",
+    ),
+    Format(
+        "LabVIEW measurement", (".lvm",), "one time for all channels or one for each, or none but the step",
+        names="columns", begins=(b"LabVIEW Measurement",),
+        source="hil.logs.csv_format:open_csv", channels="hil.logs.csv_format:write_lvm",
     ),
     Format(
         "Parquet", (".parquet",), "flat, numeric columns; time may be a timestamp",

@@ -169,6 +169,7 @@ def read_log(
     guess: bool = True,
     mapping_file: str | Path | None = None,
     tables: Files | None = None,
+    part: int = 0,
 ) -> Log:
     """Read a log of any format into channels with the product's names and units.
 
@@ -185,6 +186,8 @@ def read_log(
                 before
     tables      the machine's own tables, against whose schedule guesses are held: name without suffix -> file;
                 default: the shipped ones
+    part        which run of a table in which the header stands again, from 1; 0: all where time goes on, else the
+                longest
 
     Raises LogError, one line, for whatever cannot be used.
     """
@@ -199,7 +202,7 @@ def read_log(
     if design_rpm is not None and not (math.isfinite(design_rpm) and design_rpm > 0):
         raise LogError(f"{path}: design speed (={design_rpm:g} rpm) must be finite and above 0")
 
-    log = open_log(path, dbc, mapping, units, design_rpm, signals, guess, mapping_file, tables or {})
+    log = open_log(path, dbc, mapping, units, design_rpm, signals, guess, mapping_file, tables or {}, part)
     source, named, notes, units = log.source, log.named, log.notes, log.units
     if log.guesses.rpm:
         speed, _, words = wanted_design_speed(path, log)

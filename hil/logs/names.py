@@ -335,6 +335,8 @@ def _quantity(words: tuple[str, ...], unit: str = "") -> str:
 
 def is_time(name: str) -> tuple[float, str]:
     """How surely a name means the time, 0 to 1, and the unit that it says ("" where it says none)."""
+    if name.strip().casefold() == "x_value":  # of LabVIEW
+        return 0.9, ""
     words, unit, _ = unit_in_name(name)
     kinds, _, numbers, misspelt = _kinds(words)
     if words == ("t",):

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hil.logs.arrow import arrow_table
-from hil.logs.dates import OddRow, from_dates
+from hil.logs.dates import OddRow, date_notes, from_dates
 from hil.logs.source import Channel, LogError, Options, Source, check_file, numbers, second
 from hil.logs.table import Table, time_column
 from vaneloop.base.files import whole
@@ -87,8 +87,8 @@ def open_parquet(path: Path, options: Options) -> Source:
                     raise LogError(f"{path}: column {key!r}, row {found.row + 1}: {found.why}")
                 if found is None:
                     raise LogError(f"{path}: column {key!r} holds words that are no dates, not numbers")
-                table.notes.append(found[1])
-                return found[0]
+                table.notes += date_notes(found, 1)
+                return found.t
             if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
                 column = column.cast(pa.int64())
             if pa.types.is_boolean(kind):

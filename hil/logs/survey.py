@@ -112,6 +112,7 @@ def survey(
     guess: bool = True,
     mapping_file: str | Path | None = None,
     tables: Files | None = None,
+    part: int = 0,
 ) -> Survey:
     """Look at a log as `read_log` would read it with the same arguments; a log that cannot be read is shown with its
     complaint.
@@ -119,7 +120,7 @@ def survey(
     Raises LogError only for a file that cannot be opened at all, NoTime for a table without a time.
     """
     path = Path(path)
-    out = open_log(path, dbc, mapping, units, design_rpm, UNITS, guess, mapping_file, tables or {})
+    out = open_log(path, dbc, mapping, units, design_rpm, UNITS, guess, mapping_file, tables or {}, part)
     rows, damaged = [], False
     if isinstance(out.source, Table):
         rows.append(_time(path, out.source, out.units, {*(mapping or {}), *(mapping or {}).values()}))
@@ -147,7 +148,7 @@ def survey(
     try:
         notes = read_log(
             path, dbc=dbc, mapping=mapping, units=units, design_rpm=design_rpm, require=(), guess=guess,
-            mapping_file=mapping_file, tables=tables,
+            mapping_file=mapping_file, tables=tables, part=part,
         ).notes  # fmt: skip
     except InputError as e:
         complaint = str(e)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -9,17 +10,22 @@ from typing import NamedTuple
 import numpy as np
 
 from hil.logs.names import is_time
+from hil.logs.notes import Note
 from hil.logs.source import LogError, Options, Series, close_names, names_held
 from hil.logs.times import guess_column
 
-__all__ = ["NoTime", "Table", "Time", "split_unit", "time_column"]
+__all__ = ["TIME_NAMES", "NoTime", "Table", "Time", "split_unit", "time_column"]
 
-_TIME_NAMES = ("t", "time", "timestamp", "timestamps", "time_s", "zeit")
+TIME_NAMES = ("t", "time", "timestamp", "timestamps", "time_s", "zeit")
 
 
 class Table:
-    """Columns of a CSV or Parquet file. A header may carry the unit: `n_r [rpm]`, `n_r (rpm)`; so may a row of its own,
-    ``units``. Where it is ``framed``, a row is a frame of a bus.
+    """Columns of a table. A header may carry the unit: `n_r [rpm]`, `n_r (rpm)`; so may a row of its own, ``units``.
+    Where it is ``framed``, a row is a frame of a bus.
+
+    own     column -> the column that is its time, where that is another than ``time``
+    parts   rows (from 0) at which the logger began again, 0 the first
+    part    the one to read, from 1; 0: all where time goes on, else the longest
     """
 
     kind = "column"
@@ -33,14 +39,19 @@ class Table:
         time: Time,
         units: Mapping[str, str],
         framed: bool = False,
+        own: Mapping[str, str] | None = None,
+        parts: tuple[int, ...] = (0,),
+        part: int = 0,
     ):
-        self.notes = list(time.notes)
+        self.notes: list[str] = list(time.notes)
         self.guessed = time.sure  # how surely the column is the time, where that is guessed; 0 where it is stated
         self._load, self._first, self.time, self._units = load, first, time.name, units
-        self._framed = framed
+        self._framed, self._own, self._parts, self._part = framed, own or {}, parts, part
         self.time_unit = units.get(time.name) or split_unit(time.name)[1] or time.unit
-        self._t: np.ndarray | None = None
-        self.names = {h: tuple(dict.fromkeys((h, h.strip(), split_unit(h)[0]))) for h in headers if h != time.name}
+        self._t: dict[str, np.ndarray] = {}
+        self._rows: slice | None = None
+        times = {time.name, *self._own.values()}
+        self.names = {h: tuple(dict.fromkeys((h, h.strip(), split_unit(h)[0]))) for h in headers if h not in times}
 
     def has(self) -> str:
         return names_held(self.kind, [self.time, *self.names])
@@ -49,17 +60,46 @@ class Table:
         return ""
 
     def series(self, key: str) -> Series:
-        t, values = self.times(), self._load(key)
+        t, values = self._times(self._own.get(key, self.time)), self._load(key)[self.rows]
         if values.size != t.size:
             raise LogError(f"column {key!r} has {values.size} rows, the time column {self.time!r} has {t.size}")
         unit = self._units.get(key) or split_unit(key)[1]
-        return Series(t, values, unit, self.time_unit, "row", self._first, self._framed)
+        return Series(t, values, unit, self.time_unit, "row", self._first + (self.rows.start or 0), self._framed)
 
     def times(self) -> np.ndarray:
         """The time column's numbers as they stand."""
-        if self._t is None:
-            self._t = self._load(self.time)
-        return self._t
+        return self._times(self.time)
+
+    def _times(self, key: str) -> np.ndarray:
+        if key not in self._t:
+            self._t[key] = self._load(key)[self.rows]
+        return self._t[key]
+
+    @property
+    def rows(self) -> slice:
+        """The rows that are read: those of one part, where the logger began again and time with it."""
+        if self._rows is None:
+            self._rows = self._of_part() if len(self._parts) > 1 else slice(None)
+        return self._rows
+
+    def _of_part(self) -> slice:
+        t = self._load(self.time)
+        edges = [*self._parts, t.size]
+        spans = [t[a:b][np.isfinite(t[a:b])] for a, b in itertools.pairwise(edges)]
+        told = [s for s in spans if s.size]
+        goes_on = all(a[-1] < b[0] for a, b in itertools.pairwise(told))
+        part = self._part or (0 if goes_on else 1 + max(range(len(spans)), key=lambda k: spans[k].size))
+        again = ", ".join(str(self._first + row - 1) for row in self._parts[1:6])
+        n = len(spans)
+        done = f"part {part} of {n} is read" if part else f"its {n} parts are read as one, since time goes on"
+        self.notes.append(
+            Note(
+                f"rows: the header stands again in row {again}: {done}; --part N reads one of {n}",
+                "joined" if not part else "left out", "rows",
+                0 if not part else t.size - spans[part - 1].size, [self._first + row - 1 for row in self._parts[1:]],
+            )
+        )  # fmt: skip
+        return slice(edges[part - 1], edges[part]) if part else slice(None)
 
 
 def split_unit(header: str) -> tuple[str, str]:
@@ -96,7 +136,7 @@ def time_column(path: Path, headers: list[str], options: Options) -> Time:
     asked = next((name for name, signal in options.mapping.items() if signal == "t"), None)
     called = [(h, h.strip(), split_unit(h)[0]) for h in headers]
     for fold in (str, str.casefold):
-        for name in _TIME_NAMES if asked is None else (fold(asked),):
+        for name in TIME_NAMES if asked is None else (fold(asked),):
             for h, *others in called:
                 if name == fold(h) or any(name == fold(o) for o in others):
                     return Time(h)
@@ -117,7 +157,7 @@ def time_column(path: Path, headers: list[str], options: Options) -> Time:
     if found:
         raise NoTime(f"{path}: the time may be {' or '.join(map(repr, found[:4]))}: --map NAME=t takes one", headers)
     text = (
-        f"{path}: no time column; looked for {', '.join(_TIME_NAMES)} (--map NAME=t names "
+        f"{path}: no time column; looked for {', '.join(TIME_NAMES)} (--map NAME=t names "
         f"another){names_held('column', headers)}"
     )
     raise NoTime(text, headers)

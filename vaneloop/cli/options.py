@@ -112,6 +112,9 @@ def add_reading_options(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--no-guess", action="store_true", help="guess no name and no unit that neither the log nor an option states"
     )
+    group.add_argument(
+        "--part", metavar="N", type=int, help="the run to read, from 1, of a table in which the header stands again"
+    )
 
 
 def add_tables_option(group: Any, plant: bool = True) -> None:
@@ -250,7 +253,7 @@ def log_options(args: argparse.Namespace, source: str | None = None) -> dict[str
     Raises InputError for options without a file to read.
     """
     given = {"--dbc": args.dbc, "--map": args.map, "--unit": args.unit, "--design-rpm": args.design_rpm,
-             "--mapping": args.mapping, "--no-guess": args.no_guess or None}  # fmt: skip
+             "--mapping": args.mapping, "--no-guess": args.no_guess or None, "--part": args.part}  # fmt: skip
     if (source or args.log) is None and (idle := next((k for k, v in given.items() if v not in (None, [])), None)):
         raise InputError(f"{idle} says how to read a log, but none is given (--log LOG)")
     return {
@@ -260,6 +263,7 @@ def log_options(args: argparse.Namespace, source: str | None = None) -> dict[str
         "design_rpm": args.design_rpm,
         "guess": not args.no_guess,
         "mapping_file": args.mapping,
+        "part": args.part or 0,
         **({"tables": files_of(args.tables)} if getattr(args, "tables", None) else {}),
     }
 

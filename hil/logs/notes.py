@@ -1,0 +1,42 @@
+"""What reading did to a log, in a sentence and as data: what was left out, cut, filled, converted, guessed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+__all__ = ["Note", "counted"]
+
+MOST_ROWS = 20  # that a note lists; it counts all
+
+
+class Note(str):
+    """A note on a log: the sentence, and what it says as data.
+
+    kind   what was done: ``left out``, ``cut``, ``converted``, ``guessed``, ``joined``
+    of     what it was done to: a signal, a column, ``rows``, ``time``
+    count  how many samples or rows
+    rows   the first of them, as an editor counts
+    """
+
+    kind: str
+    of: str
+    count: int
+    rows: tuple[int, ...]
+
+    def __new__(cls, text: str, kind: str, of: str, count: int = 0, rows: Iterable[int] = ()) -> Note:
+        note = super().__new__(cls, text)
+        note.kind, note.of, note.count, note.rows = kind, of, int(count), tuple(int(r) for r in rows)[:MOST_ROWS]
+        return note
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Note, (str(self), self.kind, self.of, self.count, self.rows)
+
+
+def counted(notes: Iterable[str]) -> list[dict[str, Any]]:
+    """The notes that count something, as JSON has them."""
+    return [
+        {"kind": n.kind, "of": n.of, "count": n.count, "rows": list(n.rows), "said": str(n)}
+        for n in notes
+        if isinstance(n, Note)
+    ]

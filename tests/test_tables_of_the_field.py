@@ -1,0 +1,246 @@
+"""Tables as loggers, spreadsheets and measuring programs write them: Hypothesis writes them, every value is read to its
+last digit, and what cannot be read is counted or refused.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+
+from hil.logs import Log, LogError, read_log
+from hil.logs.notes import Note, counted
+from tests.conftest import examples
+
+SIGNALS = ("n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd")
+TWICE = settings(max_examples=examples(60), suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@st.composite
+def tables(draw: Any) -> dict[str, list[float]]:
+    """Columns of a log: t (s) and some signals, each number with up to three decimals."""
+    n = draw(st.integers(24, 60))
+    names = draw(st.lists(st.sampled_from(SIGNALS), min_size=1, unique=True))
+    seed = np.random.default_rng(draw(st.integers(0, 2**32)))
+    start, step = draw(st.integers(-2000, 2000)), draw(st.sampled_from([1, 5, 10, 25, 1000]))
+    columns = {"t": [(start + step * k) / 1000.0 for k in range(n)]}
+    return columns | {name: np.round(seed.uniform(1.5, 39.5, n), 3).tolist() for name in names}
+
+
+def written(columns: dict[str, list[float]], separator: str, comma: bool, quotes: bool, grouped: bool = False) -> str:
+    """A table as text."""
+
+    def cell(v: float) -> str:
+        text = f"{v:,.3f}" if grouped else f"{v:.3f}"
+        return text.translate(str.maketrans(",.", ".,")) if comma else text
+
+    out = io.StringIO()
+    write = csv.writer(out, delimiter=separator, quoting=csv.QUOTE_ALL if quotes else csv.QUOTE_MINIMAL).writerow
+    write(columns)
+    for row in zip(*columns.values(), strict=True):
+        write([cell(v) for v in row])
+    return out.getvalue()
+
+
+def read(folder: Path, text: str, name: str = "a.csv", **options: Any) -> Log:
+    (folder / name).write_text(text, encoding="utf-8", newline="")
+    return read_log(folder / name, require=(), **options)
+
+
+def holds(log: Log, columns: dict[str, list[float]], rows: Any = slice(None)) -> None:
+    """Every value of the table is in the log, at its time, and nothing else."""
+    assert set(log.channels) == set(columns) - {"t"}
+    for name, c in log.channels.items():
+        assert c.values.tolist() == np.asarray(columns[name])[rows].tolist()
+        assert c.t.tolist() == np.asarray(columns["t"])[rows].tolist()
+
+
+@given(
+    tables(), st.sampled_from(",;\t"), st.booleans(), st.booleans(), st.sampled_from(["", "\r\n", "preamble", "units"])
+)
+@TWICE
+def test_separator_decimal_sign_quotes_and_lines_before_the_header_change_nothing(
+    tmp_path: Path, columns: dict[str, list[float]], separator: str, comma: bool, quotes: bool, more: str
+) -> None:
+    head, *rows = written(columns, separator, comma, quotes).splitlines()
+    if more == "preamble":
+        head = f'"Rig 5"\n"Date: Tue Aug 18"\n\n{head}'
+    elif more == "units":
+        units = {"t": "s", "n_dem": "%", "n_r": "%", "x_dem": "mm", "x_lvdt": "mm", "i_cmd": ""}
+        head = f"{head}\n{separator.join(units[c] for c in columns)}"
+    log = read(tmp_path, (more if more == "\r\n" else "\n").join([head, *rows]))
+    holds(log, columns)
+    assert not [n for n in log.notes if "left out" in n]
+
+
+@given(tables(), st.booleans())
+@TWICE
+def test_signs_between_thousands_are_taken_off(tmp_path: Path, columns: dict[str, list[float]], comma: bool) -> None:
+    columns = {k: v if k == "t" else [1000.0 * x for x in v] for k, v in columns.items()}
+    columns["t"] = [t - columns["t"][0] for t in columns["t"]]
+    columns = {"t": columns["t"], "n_dem": columns[next(k for k in columns if k != "t")]}
+    text = written(columns, ";", comma, False, grouped=True)
+    log = read(tmp_path, text, units={"n_dem": "rpm"}, design_rpm=100_000.0)
+    assert log.channels["n_dem"].values == pytest.approx(np.array(columns["n_dem"]) * 1e-3, rel=1e-12)
+
+
+@given(tables(), st.data())
+@TWICE
+def test_a_row_with_another_number_of_cells_is_left_out_and_counted_or_refused(
+    tmp_path: Path, columns: dict[str, list[float]], data: st.DataObject
+) -> None:
+    head, *rows = written(columns, ",", False, False).splitlines()
+    n, cells = len(rows), len(columns)
+    wrong = sorted(data.draw(st.sets(st.integers(0, n - 1), min_size=1, max_size=n)))
+    for k in wrong:
+        other = data.draw(st.integers(1, 2 * cells + 1).filter(lambda m: m != cells))
+        rows[k] = ",".join((rows[k].split(",") + ["1"] * other)[:other])
+    good = np.setdiff1d(np.arange(n), wrong)
+    try:
+        log = read(tmp_path, "\n".join([head, *rows]))
+    except LogError as e:
+        assert f"{len(wrong)} of {n} rows have more or fewer cells than the header (first row {wrong[0] + 2}: " in str(
+            e
+        )
+        assert len(wrong) > 0.1 * n
+        return
+    holds(log, columns, good)
+    (note,) = [m for m in log.notes if isinstance(m, Note) and m.of == "rows"]
+    assert note.count == len(wrong) and note.rows == tuple(k + 2 for k in wrong)[:20]
+    assert counted(log.notes)[0] == {
+        "kind": "left out", "of": "rows", "count": len(wrong), "rows": list(note.rows), "said": str(note),
+    }  # fmt: skip
+    assert 2 * len(wrong) <= n
+
+
+@given(tables(), st.booleans())
+@TWICE
+def test_decimal_commas_between_commas_are_refused(
+    tmp_path: Path, columns: dict[str, list[float]], quotes: bool
+) -> None:
+    text = written(columns, ",", True, True)
+    if quotes:
+        holds(read(tmp_path, text), columns)
+    else:
+        with pytest.raises(LogError, match="decimal commas, or lists, between commas"):
+            read(tmp_path, text.replace('"', ""))
+
+
+@given(tables(), st.integers(1, 3), st.booleans())
+@TWICE
+def test_a_needless_column_may_stand_there_twice_and_a_needed_one_may_not(
+    tmp_path: Path, columns: dict[str, list[float]], often: int, needed: bool
+) -> None:
+    name = next(k for k in columns if k != "t") if needed else "Trigger"
+    lines = written(columns, ",", False, False).splitlines()
+    lines = [",".join([line, *["0" if k else name] * (often + (not needed))]) for k, line in enumerate(lines)]
+    if needed:
+        with pytest.raises(LogError, match=f"column '{name}' is there more than once"):
+            read(tmp_path, "\n".join(lines))
+    else:
+        holds(read(tmp_path, "\n".join(lines)), columns)
+
+
+@given(tables(), st.sampled_from(["Time", "Zeit", "timestamp [s]"]), st.sampled_from(["same", ".1"]))
+@TWICE
+def test_each_series_may_have_its_own_time(
+    tmp_path: Path, columns: dict[str, list[float]], called: str, how: str
+) -> None:
+    names = [k for k in columns if k != "t"]
+    assume(len(names) > 1)
+    late = {name: [round(t + 0.001 * k, 3) for t in columns["t"]] for k, name in enumerate(names)}
+    head = [h for k, name in enumerate(names) for h in (called + (f".{k}" if k and how == ".1" else ""), name)]
+    assume(how == "same" or "[" not in called)
+    rows = zip(*(column for name in names for column in (late[name], columns[name])), strict=True)
+    log = read(tmp_path, "\n".join([",".join(head), *(",".join(map(str, row)) for row in rows)]))
+    for name in names:
+        assert log.channels[name].t.tolist() == late[name] and log.channels[name].values.tolist() == columns[name]
+
+
+@given(tables(), st.integers(2, 22), st.booleans(), st.integers(0, 2))
+@TWICE
+def test_where_the_header_stands_again_a_part_is_named_and_each_can_be_read(
+    tmp_path: Path, columns: dict[str, list[float]], cut: int, goes_on: bool, part: int
+) -> None:
+    head, *rows = written(columns, "\t", False, False).splitlines()
+    t = columns["t"]
+    first = rows[:cut]
+    again = rows[cut:] if goes_on else rows[: len(rows) - cut]
+    text = "\n".join(['"Rig 5"', '"Capture Date: 1"', head, *first, '"Rig 5"', '"Capture Date: 2"', head, *again])
+    log = read(tmp_path, text, part=part)
+    second = np.arange(cut, len(t)) if goes_on else np.arange(len(t) - cut)
+    read_rows = {
+        0: np.arange(len(t)) if goes_on else max(np.arange(cut), second, key=len),
+        1: np.arange(cut),
+        2: second,
+    }
+    holds(log, columns, read_rows[part])
+    assert f"rows: the header stands again in row {cut + 6}: " in str(log.notes)
+    with pytest.raises(LogError, match="part 3: the log has 2 parts"):
+        read(tmp_path, text, part=3)
+    with pytest.raises(LogError, match=f"row {cut + 6}: another header stands there"):
+        read(tmp_path, "\n".join(['"Rig 5"', '"Capture Date: 1"', head, *first, "", "", f"{head}\tnew", *again]))
+
+
+@given(
+    st.integers(3, 30), st.integers(3, 30), st.sampled_from([10, 250, 1000]), st.sampled_from(["two", "one", "words"]),
+    st.integers(0, 3600),
+)  # fmt: skip
+@TWICE
+def test_the_hour_that_comes_twice_is_taken_out(
+    tmp_path: Path, before: int, after: int, step: int, form: str, back_at: int
+) -> None:
+    begin = datetime(2025, 10, 26, 2, 0, 0) + timedelta(seconds=back_at) - timedelta(milliseconds=before * step)
+    stamps = [begin + timedelta(milliseconds=k * step, hours=-(k >= before)) for k in range(before + after)]
+    between = "," if form == "two" else " "
+    form = "%d.%m.%Y" if form == "words" else "%Y-%m-%d"
+    lines = [f"{s.strftime(form)}{between}{s.strftime('%H:%M:%S.%f')[:-3]},{50 + k % 7}" for k, s in enumerate(stamps)]
+    log = read(tmp_path, "\n".join([f"{'Date,Time' if between == ',' else 'Time'},n_dem", *lines]))
+    assert log.channels["n_dem"].t == pytest.approx(np.arange(before + after) * step * 1e-3, abs=1e-6)
+    assert f"time: falls back by an hour at row {before + 2}, at the end of summer time" in str(log.notes)
+
+
+@given(st.integers(2, 20), st.integers(2, 20), st.integers(1, 300))
+@TWICE
+def test_the_day_beside_the_time_of_day_counts(tmp_path: Path, one: int, other: int, days: int) -> None:
+    begin = datetime(2026, 1, 1, 10, 0, 0)
+    stamps = [begin + timedelta(seconds=0.5 * k, days=days * (k >= one)) for k in range(one + other)]
+    lines = [f"{s:%Y-%m-%d},{s:%H:%M:%S.%f},50" for s in stamps]
+    log = read(tmp_path, "\n".join(["Date,Time,n_dem", *lines]))
+    kept = max(one, other) if max(one, other) > 10 or one == other else max(one, other)
+    assert log.channels["n_dem"].t.size == kept and np.ptp(log.channels["n_dem"].t) < 11.0
+    assert "far from all others" in str(log.notes) or "time jumps" in str(log.notes)
+
+
+@given(tables(), st.sampled_from(["One", "Multi", "No"]), st.booleans(), st.booleans())
+@TWICE
+def test_a_labview_file_has_one_time_or_several_or_a_step(
+    tmp_path: Path, columns: dict[str, list[float]], x: str, comma: bool, remarks: bool
+) -> None:
+    names, t = [k for k in columns if k != "t"], columns["t"]
+    step = round(t[1] - t[0], 3)
+    cells = {k: [str(v).replace(".", "," if comma else ".") for v in column] for k, column in columns.items()}
+    series = [[cells["t"] if x != "No" else [""] * len(t)] if k == 0 or x == "Multi" else [] for k in range(len(names))]
+    table = [c for k, name in enumerate(names) for c in (*series[k], cells[name])]
+    head = [h for k, name in enumerate(names) for h in (*["X_Value"] * len(series[k]), name)]
+    sign = "," if comma else "."
+    lines = [
+        "LabVIEW Measurement\t", "Separator\tTab", f"Decimal_Separator\t{sign}", f"X_Columns\t{x}",
+        "Date\t2016/08/11", "***End_of_Header***\t", "\t", f"Channels\t{len(names)}",
+        "\t".join(["X0", *[str(t[0]).replace(".", sign)] * len(names)]),
+        "\t".join(["Delta_X", *[str(step).replace(".", sign)] * len(names)]), "***End_of_Header***\t",
+        "\t".join([*head, "Comment"]),
+    ]  # fmt: skip
+    lines += ["\t".join(row) + ("\t" if remarks else "") for row in zip(*table, strict=True)]
+    log = read(tmp_path, "\r\n".join(lines) + "\r\n", "a.lvm")
+    assert set(log.channels) == set(names)
+    for name in names:
+        assert log.channels[name].values.tolist() == columns[name]
+        assert log.channels[name].t == pytest.approx(np.array(t), abs=1e-9)
