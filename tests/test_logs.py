@@ -686,7 +686,7 @@ def test_rows_of_a_csv_with_too_few_or_too_many_cells_are_left_out_and_told(tmp_
     assert note == (
         "rows: 3 of 7 rows have more or fewer cells than the header (first row 3: 2, the header 3): left out"
     )
-    assert isinstance(note, Note) and note.count == 3 and note.rows == (3, 4, 8)
+    assert isinstance(note, Note) and note.number == 3 and note.rows == (3, 4, 8)
     assert "row 6: 'x' is not a number" in refused(csv(tmp_path, "t,n_dem\n0,1\n1\n\n2,3\n3,x\n"))
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,12 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from hil.logs import Log, LogError, read_log
+from hil.logs.guess import mean_stroke
 from hil.logs.notes import Note, counted
+from hil.logs.plausible import judge
+from hil.logs.survey import survey
+from hil.logs.units import Units, scale_of
+from plant.geometry import load_schedules
 from tests.conftest import examples
 
 SIGNALS = ("n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd")
@@ -113,7 +119,7 @@ def test_a_row_with_another_number_of_cells_is_left_out_and_counted_or_refused(
         return
     holds(log, columns, good)
     (note,) = [m for m in log.notes if isinstance(m, Note) and m.of == "rows"]
-    assert note.count == len(wrong) and note.rows == tuple(k + 2 for k in wrong)[:20]
+    assert note.number == len(wrong) and note.rows == tuple(k + 2 for k in wrong)[:20]
     assert counted(log.notes)[0] == {
         "kind": "left out", "of": "rows", "count": len(wrong), "rows": list(note.rows), "said": str(note),
     }  # fmt: skip
@@ -244,3 +250,104 @@ def test_a_labview_file_has_one_time_or_several_or_a_step(
     for name in names:
         assert log.channels[name].values.tolist() == columns[name]
         assert log.channels[name].t == pytest.approx(np.array(t), abs=1e-9)
+
+
+# ---- gain and zero, and hints that are followed ----------------------------------------------------------------------
+
+
+@given(st.floats(-50, 50), st.sampled_from(["mm", "m", "inch", "um"]), st.floats(-40, 40), st.booleans())
+@TWICE
+def test_gain_and_zero_are_stated_with_the_unit(gain: float, unit: str, zero: float, star: bool) -> None:
+    gain, zero = float(f"{gain:.6g}"), float(f"{zero:.6g}")
+    assume(abs(gain) > 1e-6)
+    text = f"{gain:.6f}{'*' if star else ' '}{unit}{zero:+.6f}"
+    found = scale_of(text)
+    assert found[1] == unit and found[0] == pytest.approx(gain, abs=1e-6) and found[2] == pytest.approx(zero, abs=1e-6)
+    volts = np.linspace(-3.0, 3.0, 7)
+    to_mm = {"mm": 1.0, "m": 1e3, "inch": 25.4, "um": 1e-3}[unit]
+    read = Units(Path("a"), {"x_lvdt": text}, None, []).convert("x_lvdt", "V", volts, "V")
+    assert read == pytest.approx((found[0] * volts + found[2]) * to_mm, rel=1e-9, abs=1e-9)
+
+
+def run_of(seed: int, n: int = 400) -> dict[str, np.ndarray]:
+    """A log of the machine as its tables say it: demand, speed, stroke by the schedule, the inlet vane."""
+    t = np.arange(n) * 0.01
+    rng = np.random.default_rng(seed)
+    speed = 75.0 + 12.0 * np.sin(2.0 * np.pi * t / rng.uniform(2.0, 4.0))
+    stroke = np.interp(speed, *mean_stroke({}))
+    angle = np.rad2deg(load_schedules("schedules.toml").targets(speed))[:, 0]
+    return {"t": t, "n_dem": speed + 0.1, "n_r": speed, "x_dem": stroke, "x_lvdt": stroke + 0.01, "vigv": angle}
+
+
+def followed(folder: Path, columns: dict[str, Any], heads: dict[str, str]) -> tuple[Log, str]:
+    """The log read with what the line of its refusal proposes, and that line."""
+    names = [heads.get(k, k) for k in columns]
+    rows = zip(*columns.values(), strict=True)
+    text = "\n".join([",".join(names), *(",".join(repr(float(v)) for v in row) for row in rows)])
+    with pytest.raises(LogError) as refused:
+        read(folder, text)
+    line = str(refused.value)
+    units = dict(re.findall(r"--unit '?(\w+)=([^' ;,]+)", line)[:1])
+    rpm = re.search(r"--design-rpm (\d+)", line)
+    return read(folder, text, units=units, design_rpm=float(rpm[1]) if rpm else None), line
+
+
+@given(st.integers(0, 99), st.floats(0.5, 40), st.floats(-3, 3), st.sampled_from(["x_lvdt", "vigv"]), st.booleans())
+@settings(max_examples=examples(25), suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_proposed_gain_and_zero_gives_the_signal_back(
+    tmp_path: Path, seed: int, gain: float, zero: float, signal: str, turned: bool
+) -> None:
+    columns = run_of(seed)
+    gain = -gain if turned else gain
+    assume(abs(abs(gain) - 1.0) > 0.2 or turned)
+    true = columns[signal].copy()
+    columns[signal] = (true - zero) / gain
+    log, line = followed(tmp_path, columns, {signal: f"{signal} [VRMS]"})
+    assert "follows" in line
+    assert np.max(np.abs(log.channels[signal].values - true)) < 0.03 * np.ptp(true) + 0.02
+
+
+@given(
+    st.integers(0, 99), st.sampled_from(["ms", "us", "ns"]), st.sampled_from([1, 2, 5, 10, 20, 50, 100]), st.booleans()
+)
+@settings(max_examples=examples(25), suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_proposed_unit_of_time_is_the_right_one(
+    tmp_path: Path, seed: int, unit: str, step: int, two_rasters: bool
+) -> None:
+    columns = run_of(seed, 400)
+    t = np.arange(400) * step * 1e-3
+    count = {"ms": 1e3, "us": 1e6, "ns": 1e9}[unit]
+    ticks = np.rint((t + 112.345) * count)
+    assume(np.ptp(ticks) > 20_000.0)
+    columns["t"] = ticks
+    if two_rasters:
+        columns["t"] = np.where(np.arange(400) % 2, ticks - np.rint(0.3e-3 * step * count), ticks)
+    log, line = followed(tmp_path, columns, {"t": "timestamp"})
+    assert f"--unit t={unit}" in line
+    assert np.ptp(log.channels["n_dem"].t) == pytest.approx(np.ptp(t), rel=0.02)
+
+
+UNITS_THAT_ARE_TOLD = [
+    ("p_s", 210.0, "bar"), ("p_s", 21e6, "Pa"), ("p_s", 3046.0, "psi"), ("t_oil", 313.0, "K"), ("x_lvdt", 24_000.0, "um"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("signal", "value", "unit"), UNITS_THAT_ARE_TOLD)
+def test_a_proposed_unit_gives_a_plausible_channel(tmp_path: Path, signal: str, value: float, unit: str) -> None:
+    columns = run_of(3) | {signal: value * (1.0 + 0.01 * np.sin(np.arange(400.0)))}
+    log, line = followed(tmp_path, columns, {})
+    assert f"--unit {signal}={unit}" in line
+    assert judge(signal, log.channels[signal].values)[1] == ""
+
+
+def test_a_speed_that_is_0_throughout_asks_for_the_design_speed(tmp_path: Path) -> None:
+    for name in ("N1_rpm", "N1_DEM_rpm", "n_dem [rpm]"):
+        text = f"t,{name}\n" + "".join(f"{0.01 * k:.2f},0\n" for k in range(60))
+        with pytest.raises(LogError, match="--design-rpm R"):
+            read_log_text(tmp_path, text)
+        assert survey(tmp_path / "a.csv").suggested_rpm is None
+
+
+def read_log_text(folder: Path, text: str) -> Log:
+    (folder / "a.csv").write_text(text)
+    return read_log(folder / "a.csv", require=("n_dem",))

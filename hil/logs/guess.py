@@ -17,11 +17,12 @@ import numpy as np
 from hil.logs import plausible
 from hil.logs.names import Meaning, bracketed, lacks, meaning, spool, unit_kind
 from hil.logs.source import LogError, Source
-from hil.logs.units import NO_UNIT, factor_of
+from hil.logs.units import NO_UNIT, factor_of, scale_of
 from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES
 
-__all__ = ["ENOUGH", "Files", "Guess", "Guesses", "contradictions", "design_speed", "guess", "withdrawn"]
+__all__ = ["ENOUGH", "Files", "Guess", "Guesses", "contradictions", "design_speed", "guess", "mean_stroke",
+           "withdrawn"]
 
 ENOUGH = 0.7  # confidence below which a name is only mentioned
 ALIKE = 0.1  # two candidates whose confidences differ by no more are not told apart
@@ -196,8 +197,9 @@ def _unit(
     for unit, where in ((stated, "you say"), (in_file, "the log says"), (in_name, "its name says")):
         if unit.strip().casefold() in NO_UNIT or unit.strip() == "1":
             continue
-        given, sign = unit, -1.0 if where == "you say" and unit.startswith("-") else 1.0
-        unit = unit.removeprefix("-")
+        given = unit
+        gain, unit, zero = scale_of(unit) if where == "you say" else (1.0, unit, 0.0)
+        scaled = gain * v + zero
         factor, speed = factor_of(unit, own), None
         if signal in ("n_dem", "n_r") and not isinstance(factor, tuple):
             speed = factor_of(unit, "rpm")
@@ -209,9 +211,9 @@ def _unit(
             if factor is None and where == "the log says":
                 continue  # a unit that nobody knows
             return None, 0.0, f"{where} {unit}, which is no unit of {signal}"
-        if why := plausible.judge(signal, sign * v * factor[0] + factor[1])[1]:
+        if why := plausible.judge(signal, scaled * factor[0] + factor[1])[1]:
             return None, 0.0, f"{where} {unit}, but {why}"
-        size = float(np.percentile(np.abs(v * factor[0] + factor[1]), 99.0))
+        size = float(np.percentile(np.abs(scaled * factor[0] + factor[1]), 99.0))
         if signal == "p_s" and where != "you say" and not _USUAL["p_s"]["MPa"][0] <= size <= _USUAL["p_s"]["MPa"][1]:
             return None, 0.0, f"{where} {unit}, but its values reach {size:.3g} MPa, and a supply has 8 to 40"
         return given, 1.0, f"{where} {given}"
@@ -305,8 +307,8 @@ def contradictions(channels: Mapping[str, _Samples], guessed: set[str], tables: 
     return out
 
 
-def _mean_stroke(tables: Files) -> tuple[np.ndarray, np.ndarray]:
-    """The controller's mean curve: rotor speed (%), stroke (mm)."""
+def mean_stroke(tables: Files) -> tuple[np.ndarray, np.ndarray]:
+    """Return the controller's mean curve: rotor speed (%), stroke (mm)."""
     from controller import load_calibration  # late: with numba and scipy, which only a guess of these needs
 
     calibration, strokes, angles = (tables.get(n, f"{n}.toml") for n in ("calibration", "stroke_tables", "vane_angles"))
@@ -316,7 +318,7 @@ def _mean_stroke(tables: Files) -> tuple[np.ndarray, np.ndarray]:
 
 def _off_schedule(stroke: np.ndarray, speed: np.ndarray, tables: Files) -> str:
     """Why a stroke that follows the schedule, in its own way, has another zero or unit; "" where it has not."""
-    at, curve = _mean_stroke(tables)
+    at, curve = mean_stroke(tables)
     planned, off = np.interp(speed, at, curve), _OFF * float(np.ptp(curve))
     if off <= 0.0 or _together(stroke, planned, 0.5 * off, off) < 0.7:
         return ""
@@ -363,10 +365,12 @@ def design_speed(speed: _Samples, stroke: _Samples | None, tables: Files = _SHIP
     three.
     """
     t, n = speed
-    top = float(np.percentile(n, 99.9))
+    top = float(np.percentile(np.abs(n), 99.9)) if n.size else 0.0
+    if top == 0.0:
+        return 0.0, "it is 0 throughout"
     best, why = top, f"the largest speed is {top:,.0f} rpm"
     if stroke is not None and np.ptp(stroke[1]) > 8.0:
-        of, curve = _mean_stroke(tables)
+        of, curve = mean_stroke(tables)
         at = np.linspace(t[0], t[-1], 2000)
         speeds, strokes = np.interp(at, t, n), np.interp(at, *stroke)
         trial = top * np.linspace(0.7, 1.6, 901)

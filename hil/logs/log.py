@@ -18,10 +18,11 @@ import numpy as np
 from hil.logs import plausible
 from hil.logs.formats import format_of
 from hil.logs.guess import Files, Guess
-from hil.logs.opening import is_ours, open_log, wanted_design_speed
+from hil.logs.opening import Opened, is_ours, open_log, sketch, wanted_design_speed
+from hil.logs.scale import proposed_scale
 from hil.logs.source import ABSENT, Channel, LogError, Options, Series, Source, close_names, find, is_absent
 from hil.logs.table import NoTime
-from hil.logs.units import Units
+from hil.logs.units import UnitError, Units
 from vaneloop.base.signals import UNITS
 
 __all__ = ["Channel", "Log", "LogError", "offered", "read_log", "write_log"]
@@ -52,7 +53,8 @@ class Log:
         _refuse_units(self.path, wrong)
         times = [c.t for c in self.channels.values() if c.t.size]
         if times and (why := plausible.span_complaint(times)):
-            raise LogError(f"{self.path}: {why}; --unit t=ms, if time counts in ms")
+            unit = plausible.unit_of_time(max(times, key=len))
+            raise LogError(f"{self.path}: {why}; --unit t={unit}, if time counts in {unit}")
 
 
 def _refuse_units(path: str | Path, wrong: list[tuple[str, str, str, np.ndarray]]) -> None:
@@ -229,7 +231,13 @@ def read_log(
                 if (id(s.t), s.t_unit) not in times:
                     times[id(s.t), s.t_unit] = s.t, _in_seconds(path, unit, s)
                 t = times[id(s.t), s.t_unit][1]
-                values = unit.convert(signal, key, s.values, s.unit)
+                try:
+                    values = unit.convert(signal, key, s.values, s.unit)
+                except UnitError as e:
+                    raise LogError(f"{e}{_scale(path, log, signal, t, s.values)}") from None
+                if signal in unit.unknown and (found := _scale(path, log, signal, t, s.values)):
+                    what = f"unit {unit.unknown[signal]!r} is not known, and it is not {signals[signal]}"
+                    raise LogError(f"{path}: {signal} ({key}): {what}{found}")
             if values is not s.values:
                 values = np.where(is_absent(s.values), ABSENT, values)
             if not source.sorted:
@@ -262,12 +270,23 @@ def read_log(
     return Log(str(path), channels, list(dict.fromkeys([*source.notes, *notes])), signals, made)
 
 
+def _scale(path: Path, log: Opened, signal: str, t: np.ndarray, values: np.ndarray) -> str:
+    """What to state of a signal whose unit does not say it, where the log's other signals do; else ""."""
+    good = np.isfinite(t) & np.isfinite(values)
+    others = {n: c for n, c in sketch(path, log, UNITS).items() if n != signal}
+    found = proposed_scale(signal, (t[good], values[good]), others, log.tables) if is_ours(signal, UNITS) else None
+    return f"; it follows {found[1]} with --unit '{signal}={found[0]}'" if found else ""
+
+
 def _in_seconds(path: Path, unit: Units, s: Series) -> np.ndarray:
     """The times of a series in s."""
     t = unit.convert("t", "t", s.t, s.t_unit)
-    if not plausible.latest(t[np.isfinite(t)]):
+    known = t[np.isfinite(t)]
+    if not plausible.latest(known):
+        of = plausible.unit_of_time(known)
         raise LogError(
-            f"{path}: time (={np.nanmedian(t):.6g} s) must be below {plausible.LATEST:g} s; --unit t=ms, if it is in ms"
+            f"{path}: time (={np.median(known):.6g} s) must be below {plausible.LATEST:g} s; --unit t={of}, if it is "
+            f"in {of}"
         )
     return t
 

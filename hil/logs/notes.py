@@ -13,30 +13,30 @@ MOST_ROWS = 20  # that a note lists; it counts all
 class Note(str):
     """A note on a log: the sentence, and what it says as data.
 
-    kind   what was done: ``left out``, ``cut``, ``converted``, ``guessed``, ``joined``
-    of     what it was done to: a signal, a column, ``rows``, ``time``
-    count  how many samples or rows
-    rows   the first of them, as an editor counts
+    kind    what was done: ``left out``, ``cut``, ``converted``, ``guessed``, ``joined``
+    of      what it was done to: a signal, a column, ``rows``, ``time``
+    number  how many samples or rows
+    rows    the first of them, as an editor counts
     """
 
     kind: str
     of: str
-    count: int
+    number: int
     rows: tuple[int, ...]
 
-    def __new__(cls, text: str, kind: str, of: str, count: int = 0, rows: Iterable[int] = ()) -> Note:
+    def __new__(cls, text: str, kind: str, of: str, number: int = 0, rows: Iterable[int] = ()) -> Note:
         note = super().__new__(cls, text)
-        note.kind, note.of, note.count, note.rows = kind, of, int(count), tuple(int(r) for r in rows)[:MOST_ROWS]
+        note.kind, note.of, note.number, note.rows = kind, of, int(number), tuple(int(r) for r in rows)[:MOST_ROWS]
         return note
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Note, (str(self), self.kind, self.of, self.count, self.rows)
+        return Note, (str(self), self.kind, self.of, self.number, self.rows)
 
 
 def counted(notes: Iterable[str]) -> list[dict[str, Any]]:
     """The notes that count something, as JSON has them."""
     return [
-        {"kind": n.kind, "of": n.of, "count": n.count, "rows": list(n.rows), "said": str(n)}
+        {"kind": n.kind, "of": n.of, "count": n.number, "rows": list(n.rows), "said": str(n)}
         for n in notes
         if isinstance(n, Note)
     ]

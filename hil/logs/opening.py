@@ -19,11 +19,11 @@ from hil.logs.names import CERTAIN, unit_behind, unit_in_name, unit_kind
 from hil.logs.source import LogError, Options, Source, close_names, find
 from hil.logs.table import Table
 from hil.logs.times import guess_unit
-from hil.logs.units import NO_UNIT, USUAL_UNITS, Units, factor_of
+from hil.logs.units import NO_UNIT, USUAL_UNITS, Units, factor_of, scale_of
 from vaneloop.base.errors import meant
 from vaneloop.base.signals import UNITS
 
-__all__ = ["Opened", "is_ours", "open_log", "wanted_design_speed"]
+__all__ = ["Opened", "is_ours", "open_log", "sketch", "wanted_design_speed"]
 
 
 def is_ours(name: str, signals: Mapping[str, str]) -> bool:
@@ -55,7 +55,7 @@ def _pairs(path: Path, mapping: Mapping[str, str] | None, signals: Mapping[str, 
 def _known_units(path: Path, stated: Mapping[str, str], signals: Mapping[str, str]) -> None:
     """Refuse a unit that the user states and that is none of its signal's: no name is looked for under it."""
     for signal, unit in stated.items():
-        text = unit.strip().removeprefix("-")
+        gain, text, _ = scale_of(unit)
         own = signals.get(signal, "s")
         if signal == "state" or text == own or text.casefold() in NO_UNIT:
             continue
@@ -65,6 +65,8 @@ def _known_units(path: Path, stated: Mapping[str, str], signals: Mapping[str, st
             what = f"unit is not known{meant(text, USUAL_UNITS)}" if factor is None else "unit does not convert"
             allowed = "%, rpm, Hz or rad/s" if signal in ("n_dem", "n_r") else f"{own} or what converts to it"
             raise LogError(f"{path}: --unit {signal}={unit}: {what}; allowed: {allowed}")
+        if gain == 0.0:
+            raise LogError(f"{path}: --unit {signal}={unit}: its gain is 0; allowed: any other number")
 
 
 @dataclass
@@ -153,8 +155,7 @@ def open_log(
                 unit = source.series(alike[0]).unit or _said(signal, alike[0], signals[signal]) or signals[signal]
                 out.guesses.made[signal] = Guess(signal, alike[0], unit, CERTAIN, "its name in other letters")
     if out.guesses.made:
-        sketch = _sketch(path, out, signals)
-        withdrawn(out.guesses, sketch, tables)
+        withdrawn(out.guesses, sketch(path, out, signals), tables)
     for signal, g in out.guesses.made.items():
         named[signal] = g.name
         out.units.setdefault(signal, g.unit)
@@ -206,10 +207,10 @@ def _guess_time(path: Path, out: Opened) -> None:
         )
 
 
-def _sketch(path: Path, out: Opened, signals: Mapping[str, str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def sketch(path: Path, out: Opened, signals: Mapping[str, str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Channels as they will be read, without care for single samples: t (s), values (own unit)."""
     unit = Units(path, {**{s: g.unit for s, g in out.guesses.made.items()}, **out.units}, out.design_rpm, [], signals)
-    sketch = {}
+    seen = {}
     for signal in signals:
         g = out.guesses.made.get(signal)
         keys = [g.name] if g else find(out.source, out.named.get(signal, signal), signal in out.named)
@@ -226,8 +227,8 @@ def _sketch(path: Path, out: Opened, signals: Mapping[str, str]) -> dict[str, tu
             order = np.argsort(t[good], kind="stable")
             t, v = t[good][order], v[good][order]
             last = np.append(np.diff(t) > 0, True)
-            sketch[signal] = t[last], v[last]
-    return sketch
+            seen[signal] = t[last], v[last]
+    return seen
 
 
 def wanted_design_speed(path: Path, out: Opened) -> tuple[str, float, str]:
@@ -240,10 +241,9 @@ def wanted_design_speed(path: Path, out: Opened) -> tuple[str, float, str]:
     factor = factor_of(unit, "rpm")
     t = Units(path, out.units, None, [], UNITS).convert("t", "t", s.t, s.t_unit)
     good = np.isfinite(t) & np.isfinite(s.values)
-    sketch = _sketch(path, out, UNITS)
+    seen = sketch(path, out, UNITS)
     speed = t[good], s.values[good] * (factor[0] if isinstance(factor, tuple) else 1.0)
-    rpm, why = design_speed(speed, sketch.get("x_lvdt", sketch.get("x_dem")), out.tables)
-    words = (
-        f"{name!r} is in {unit} and needs the design speed to become %: --design-rpm {rpm:g}, if that is 100 % ({why})"
-    )
+    rpm, why = design_speed(speed, seen.get("x_lvdt", seen.get("x_dem")), out.tables)
+    said = f"--design-rpm {rpm:g}, if that is 100 % ({why})" if rpm else f"--design-rpm R states it ({why})"
+    words = f"{name!r} is in {unit} and needs the design speed to become %: {said}"
     return signal, rpm, words

@@ -28,6 +28,7 @@ __all__ = [
     "out_of_order",
     "span_complaint",
     "too_small",
+    "unit_of_time",
 ]
 
 # share of a channel's samples (or a log's rows) that may be wrong one by one; more is a wrong unit, or a wrong clock
@@ -39,6 +40,8 @@ JUMP = 1e4
 SLOWEST = 10.0
 LONGEST = 1e5  # s, 28 h: the simulation holds all of it in memory, 30 kB a second
 LATEST = 1e10  # s since 1970, the year 2286
+CLOCKS = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}  # what else loggers count in, s
+USUAL_STEP = 1e-2  # s from row to row
 
 
 @dataclass(frozen=True)
@@ -300,6 +303,14 @@ def longest_part(times: list[np.ndarray]) -> tuple[float, float, str, str]:
         f"{t.size:,} stamps"
     )
     return a, b, words, ""
+
+
+def unit_of_time(t: np.ndarray) -> str:
+    """Unit in which a time must count that is too long in s: the one that puts its rows nearest to a row each 10 ms."""
+    step = float(np.median(np.diff(np.unique(t)))) if t.size > 1 else 0.0
+    if not step > 0.0:
+        return "ms"
+    return min(CLOCKS, key=lambda unit: abs(np.log(step * CLOCKS[unit] / USUAL_STEP)))
 
 
 def span_complaint(times: list[np.ndarray], number: Callable[[float], str] = "{:,.6g}".format) -> str:

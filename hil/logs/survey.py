@@ -142,8 +142,8 @@ def survey(
     other = {n: out.guesses.unused.get(n, "") for n in out.source.names if n not in used}
     open_, suggested = dict(out.guesses.open), None
     if out.guesses.rpm:
-        signal, suggested, words = wanted_design_speed(path, out)
-        open_[signal] = words
+        signal, rpm, words = wanted_design_speed(path, out)
+        suggested, open_[signal] = rpm or None, words
     notes, complaint = list(out.notes), ""
     try:
         notes = read_log(

@@ -15,7 +15,7 @@ import numpy as np
 from hil.logs.source import LogError
 from vaneloop.base.signals import UNITS
 
-__all__ = ["NO_UNIT", "USUAL_UNITS", "Units", "factor_of", "registry"]
+__all__ = ["NO_UNIT", "USUAL_UNITS", "UnitError", "Units", "factor_of", "registry", "scale_of"]
 
 _SPEED = ("n_dem", "n_r")
 _ALIASES = {
@@ -30,6 +30,10 @@ _ALIASES = {
 }  # fmt: skip
 # A unit text comes from a file: 9**9**9 would keep pint busy for hours.
 _UNIT = re.compile(r"[A-Za-z%°µμΩ_/*^.0-9 ()-]*")
+_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_SCALED = re.compile(
+    rf"(?P<sign>-?) *(?P<gain>{_NUMBER})? *\*? *(?P<unit>[A-Za-z%°µμΩ][^+]*?) *(?P<zero>[+-] *{_NUMBER})?"
+)  # gain * unit + zero
 _POWER_TOWER = re.compile(r"(\*\*|\^)\s*-?\d{2}|(\*\*|\^).*(\*\*|\^)|\d{4}")
 
 
@@ -69,11 +73,36 @@ def factor_of(unit: str, into: str) -> tuple[float, float] | None | str:
     return b - a, a
 
 
+@functools.lru_cache(maxsize=256)
+def scale_of(text: str) -> tuple[float, str, float]:
+    """What a user says of a number in the log: gain, unit and zero of ``0.1*mA``, ``17.14*mm-12``, ``-deg+80``.
+
+    The number times the gain, and the zero, are in the unit. A unit alone has the gain 1, with a minus -1.
+    """
+    text = text.strip()
+    if (
+        text.removeprefix("-").strip().casefold() in NO_UNIT
+        or factor_of(text.removeprefix("-"), "s") is not None
+        or (m := _SCALED.fullmatch(text)) is None
+    ):
+        return (-1.0, text[1:].strip(), 0.0) if text.startswith("-") and len(text) > 1 else (1.0, text, 0.0)
+    gain = float(m["gain"] or 1.0) * (-1.0 if m["sign"] else 1.0)
+    return gain, m["unit"].strip(), float((m["zero"] or "0").replace(" ", ""))
+
+
 USUAL_UNITS = (
     "%", "ratio", "rpm", "Hz", "rad/s", "mm", "cm", "m", "um", "inch", "mA", "A", "uA", "MPa", "bar", "psi", "kPa",
     "Pa", "degC", "degF", "K", "deg", "rad", "s", "ms", "us",
 )  # fmt: skip
 NO_UNIT = ("", "-", "none", "n/a", "null")  # and "1" where a file says it: MDF writers put it for "nothing"
+
+
+class UnitError(LogError):
+    """A unit that is not the signal's: ``key`` of the log has it, for the ``signal``."""
+
+    def __init__(self, text: str, signal: str, key: str):
+        super().__init__(text)
+        self.signal, self.key = signal, key
 
 
 @dataclass(frozen=True)
@@ -85,21 +114,23 @@ class Units:
     design_rpm: float | None
     notes: list[str]
     signals: Mapping[str, str] = field(default_factory=lambda: UNITS)
+    unknown: dict[str, str] = field(default_factory=dict)  # signal -> unit of the log that nobody knows
 
     def convert(self, signal: str, key: str, values: np.ndarray, unit: str) -> np.ndarray:
         own = self.signals.get(signal, "s")
         stated = signal in self.stated
-        unit = self.stated.get(signal, unit).strip()
+        unit, gain, zero = unit.strip(), 1.0, 0.0
+        if stated:
+            gain, unit, zero = scale_of(self.stated[signal])
+        if gain != 1.0 or zero != 0.0:
+            values = gain * values + zero
         if signal == "state" or unit == own or unit.casefold() in NO_UNIT or (unit == "1" and not stated):
             return values
-        sign = -1.0 if stated and unit.startswith("-") and len(unit) > 1 else 1.0  # counts the other way
-        unit = unit.removeprefix("-") if sign < 0.0 else unit
         factor = factor_of(unit, own)
         if isinstance(factor, tuple):
-            if sign < 0.0:
-                return -values * factor[0] + factor[1]
             return values if factor == (1.0, 0.0) else values * factor[0] + factor[1]
         if factor is None and not stated:
+            self.unknown[signal] = unit
             self.notes.append(f"{signal} ({key}): unit {unit!r} is not known, {own} assumed")
             return values
         allowed = f"{own} or what converts to it"
@@ -112,6 +143,7 @@ class Units:
                     raise LogError(
                         f"{self.path}: {signal} ({key}) is in {unit} and needs the design speed to become %; {way}"
                     )
-                return values * (sign * speed[0] * 100.0 / self.design_rpm)
+                return values * (speed[0] * 100.0 / self.design_rpm)
         what = "unit is not known" if factor is None else "unit does not convert"
-        raise LogError(f"{self.path}: {signal} ({key}) in {unit!r}: {what}; allowed: {allowed} (--unit {signal}=...)")
+        allowed += f" (--unit {signal}=..., with gain and zero --unit '{signal}=2.5*{own}-10')"
+        raise UnitError(f"{self.path}: {signal} ({key}) in {unit!r}: {what}; allowed: {allowed}", signal, key)

@@ -134,6 +134,7 @@ def demand_of_log(log: Any) -> Demand:
     if "n_r" in log.channels:
         r = log.channels["n_r"]
         t = np.union1d(c.t, r.t)
+        t = t[t >= max(c.t[0], r.t[0])] if len(r.t) > 1 else c.t
         n_r = r.values[held(r, t)]
     n_dem = c.values[held(c, t)]
     return _checked(Demand(t - t[0], n_dem, n_r, held=True), log.path)

@@ -17,7 +17,7 @@ import numpy as np
 from controller import load_calibration
 from hil.figures import error_figures
 from hil.logs import LogError
-from hil.logs.held import ANSWERS, COMMANDS, answers, held, phase_of_ticks, taken
+from hil.logs.held import ANSWERS, COMMANDS, SAME, answers, held, phase_of_ticks, taken
 from hil.loop.lockstep import FRAME, Stimulus, lockstep
 from plant import build_plant
 from vaneloop.base.signals import UNITS
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 __all__ = ["ReplayResult", "replay", "replay_json"]
 
 STAGE = {"n_r": "engine", "x_dem": "demand", "i_cmd": "servo", "x_lvdt": "actuator", **dict.fromkeys(VANES, "linkage")}
+DRIVERS = ("n_dem", "n_r", "p_s", "t_oil")  # what the simulated loop takes from the log
+BRIDGED = 0.1  # s, the longest period of the product's own frames that carry a driver
 STATISTICS = ("rms", "mean_abs", "max_abs", "mean_abs_99_100")
 
 
@@ -71,18 +73,20 @@ def replay(
     """
     machine = plant or build_plant()
     cal = calibration or load_calibration(strategy=strategy)
-    demand = log.channels["n_dem"]
+    notes, known = list(log.notes), dict(floors or {})
+    channels, begin = _driven(log, notes)
+    demand = channels["n_dem"]
     end = float(demand.t[-1])
     if end < 0.1:
         raise LogError(f"{log.path}: n_dem: lasts {end:g} s; at least 0.1 s is needed")
     raster = float(np.median(np.diff(demand.t))) if len(demand.t) > 1 else end
-    first = phase_of_ticks(log.channels, FRAME)
+    first = phase_of_ticks(channels, FRAME)
     ticks = first + np.arange(int((end - first) * 100.0 + 1e-6) + 1) * 1e-2
-    had = taken(log.channels, ticks, 0.5 * FRAME)
+    had = taken(channels, ticks, 0.5 * FRAME)
     given = {
         name: c.values[held(c, had if name in COMMANDS and c.framed else ticks)]
-        for name in ("n_dem", "n_r", "p_s", "t_oil")
-        if (c := log.channels.get(name)) is not None
+        for name in DRIVERS
+        if (c := channels.get(name)) is not None
     }
     stimulus = Stimulus.of(
         given["n_dem"],
@@ -90,9 +94,9 @@ def replay(
         given["p_s"] * 1e6 if "p_s" in given else machine.usual["p_s"] * 1e6,
         given.get("t_oil", machine.usual["t_oil"]),
     )
-    angles = tuple(np.deg2rad(log.channels[a].values[0]) if a in log.channels else np.nan for a in machine.vanes)
-    start = float(log.channels["x_dem"].values[0]) * 1e-3 if "x_dem" in log.channels else None
-    outputs = [log.channels[s] for s in STAGE if s in log.channels]
+    angles = tuple(np.deg2rad(_begins(channels[a])) if a in channels else np.nan for a in machine.vanes)
+    start = _begins(channels["x_dem"]) * 1e-3 if "x_dem" in channels else None
+    outputs = [channels[s] for s in STAGE if s in channels]
     fine = min((float(np.median(np.diff(c.t))) for c in outputs if len(c.t) > 1), default=1e-2) < 5e-3
     run = lockstep(
         stimulus,
@@ -110,7 +114,6 @@ def replay(
         model["i_motor"] = run.columns["i_motor"]
     speed = run.columns["n_r"]
     target = dict(zip(machine.vanes, np.rad2deg(machine.schedules.targets(speed)).T, strict=True))
-    notes, known = list(log.notes), dict(floors or {})
     gap = max(0.5, 5.0 * raster)
     holes = np.diff(demand.t) > gap
     if holes.any():
@@ -118,16 +121,16 @@ def replay(
             f"n_dem: {int(holes.sum())} gaps longer than {gap:g} s; the last value is held and errors there do not "
             f"count"
         )
-    in_ticks = answers(log.channels) is not None
+    in_ticks = answers(channels) is not None
     signals = []
     for name, stage in STAGE.items():
-        if name in log.channels and name not in model:
+        if name in channels and name not in model:
             notes.append(f"{name}: this machine has no such vane row (geometry); not compared")
-        elif name in log.channels:
-            c = log.channels[name]
+        elif name in channels:
+            c = channels[name]
             if name in COMMANDS and c.framed:  # the plant's engine gets a demand when the controller has it
                 c = _when_had(c, ticks, had)
-            use = (c.t <= end + 1e-9) & ~_in_hole(c.t, demand, gap)
+            use = (c.t >= -SAME) & (c.t <= end + 1e-9) & ~_in_hole(c.t, demand, gap)
             if use.any():
                 sent = in_ticks and c.framed and name in ANSWERS and name != "i_cmd"
                 values = _model_at(name, t, model[name], _in_tick(c.t, t) if sent else c.t)
@@ -155,8 +158,32 @@ def replay(
                 )
             )
     return ReplayResult(
-        log.path, run.simulated_s, run.wall_s, run.state_hash, signals, t, model, target, dict(log.channels), notes
-    )
+        log.path, run.simulated_s, run.wall_s, run.state_hash, signals, t + begin, model, target, dict(log.channels),
+        notes,
+    )  # fmt: skip
+
+
+def _driven(log: Log, notes: list[str]) -> tuple[dict[str, Channel], float]:
+    """The channels in time since all drivers are known, and when that is (s of the log's time): of what was before it
+    nobody knows what drove it. A driver of a single sample is a constant; one of a slower raster is known as long
+    before its first sample as its samples are apart, up to `BRIDGED`.
+    """
+    first = {"n_dem": float(log.channels["n_dem"].t[0])}
+    for name in DRIVERS[1:]:
+        if (c := log.channels.get(name)) is not None and len(c.t) > 1:
+            first[name] = float(c.t[0]) - min(float(np.median(np.diff(c.t))), BRIDGED)
+    last = max(first, key=lambda n: first[n])
+    begin = first[last]
+    before = begin - min(float(c.t[0]) for c in log.channels.values())
+    if before > 0.5:
+        notes.append(f"the first {before:.4g} s of the log are before {last} begins: not simulated, not compared")
+    same: dict[int, np.ndarray] = {}  # channels of a table share their time
+    return {n: replace(c, t=same.setdefault(id(c.t), c.t - begin)) for n, c in log.channels.items()}, begin
+
+
+def _begins(c: Channel) -> float:
+    """A channel's value at time 0: of the last sample before it, or the first behind."""
+    return float(c.values[held(c, np.zeros(1))][0])
 
 
 def _when_had(c: Channel, ticks: np.ndarray, had: np.ndarray) -> Channel:
