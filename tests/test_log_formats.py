@@ -24,6 +24,7 @@ from vaneloop.cli.main import main
 from vaneloop.fleet.sources import find
 
 PAGE = (ROOT / "docs" / "logs.md").read_text(encoding="utf-8")
+SUFFIXES = tuple(dict.fromkeys(s for f in OURS for s in f.suffixes))
 T = np.arange(400) * 0.01
 SPEED = 60.0 + 10.0 * np.sin(T)
 
@@ -37,12 +38,15 @@ def test_a_format_of_ours_has_its_parts(of: Format) -> None:
         if (place := getattr(of, part)) is not None:
             assert callable(_function(place)), (of.name, part)
     assert of.source or of.frames
-    assert of.channels or of.frames_out
+    written = bool(of.channels or of.frames_out)
+    assert all((FORMATS.get(s) is of) == written for s in of.suffixes if written or s not in FORMATS)
     assert not of.extra or of.extra in EXTRAS
 
 
-def test_no_suffix_is_two_formats_and_none_begins_as_another() -> None:
-    assert len(FORMATS) == sum(len(f.suffixes) for f in OURS)
+def test_formats_that_share_a_suffix_are_told_by_their_beginning_and_none_begins_as_another() -> None:
+    for suffix in suffixes():
+        alike = [f for f in OURS if suffix in f.suffixes]
+        assert sum(not f.begins for f in alike) <= 1 and sum(bool(f.channels or f.frames_out) for f in alike) <= 1
     begins = [b for f in OURS for b in f.begins]
     assert not [(a, b) for a in begins for b in begins if a is not b and a.startswith(b)]
 
@@ -134,7 +138,7 @@ def test_the_package_of_the_page_is_read_written_and_recorded_to(rig: Path, tmp_
     write_log(tmp_path / "copy.rig", {k: log.channels[k] for k in ("n_dem", "n_r")})
     again = read_log(tmp_path / "copy.rig")
     assert again.channels["n_dem"].values == pytest.approx(log.channels["n_dem"].values)
-    assert suffixes() == (*FORMATS, ".rig") and ".rig" in [s for f in with_part("channels") for s in f.suffixes]
+    assert suffixes() == (*SUFFIXES, ".rig") and ".rig" in [s for f in with_part("channels") for s in f.suffixes]
     with pytest.raises(InputError, match=r"suffix '\.rig' is not one of a recording; allowed: candump"):
         check_name(tmp_path / "run.rig")
     with pytest.raises(LogError, match=r"suffix '\.rig' is not a recording's; allowed: \.log"):
@@ -222,7 +226,7 @@ def test_a_broken_format_of_a_package_is_one_line_and_blocks_nobody(
 def test_no_package_takes_a_suffix_of_ours_or_one_that_is_none(installed: Callable[..., Path], tmp_path: Path) -> None:
     taken = "\n".join(f"{s} = rig_logs:RIG" for s in (*FORMATS, ".CSV", "csv", ".a b", ".x) rm -rf", ".tar.gz"))
     installed("raise SystemExit('loaded')", taken)
-    assert suffixes() == tuple(FORMATS)
+    assert suffixes() == SUFFIXES
     for suffix, of in FORMATS.items():
         assert format_of(tmp_path / f"a{suffix}") is of and format_of(tmp_path / f"a{suffix.upper()}") is of
 

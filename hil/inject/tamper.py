@@ -32,7 +32,7 @@ from hil.inject.actions import (
     identifier,
     raw_signal,
 )
-from hil.logs.formats import format_of
+from hil.logs.formats import format_at
 from vaneloop.base.errors import InputError
 
 __all__ = ["Gateway", "Intruder", "tick_of"]
@@ -263,7 +263,7 @@ class Intruder:
 def _old_frames(action: Replay) -> tuple[dict[int, list[Words]], int]:
     """Return the frames of a CAN log by ms from its first, and the log's length in ms."""
     path = Path(str(action.log))
-    log = format_of(path, "frames", "holds no frames to replay").read_frames(path)
+    log = format_at(path, "frames", "holds no frames to replay").read_frames(path)
     wanted = None if action.frame is None else identifier(action.frame)
     ms = np.rint(log.t * 1000.0).astype(int).tolist()
     out: dict[int, list[Words]] = {}

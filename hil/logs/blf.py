@@ -32,7 +32,7 @@ def read_blf(path: Path) -> Frames:
     notes = [f"{damaged + more} damaged places in the BLF: what is there was left out"] if damaged + more else []
     parts = [part for kind in (_CAN, _CAN2, _FD, _FD64) for part in _blf_frames(stream, objects, kind)]
     if not any(part[0].size for part in parts):  # remote frames may be all there are
-        raise LogError(f"{path}: no CAN frame in it")
+        raise LogError(f"{path}: no CAN data frame in it")
     order = np.argsort(np.concatenate([p[0] for p in parts]), kind="stable")
     _, ns, ident, bus, length = (np.concatenate([p[k] for p in parts])[order] for k in range(5))
     wide = 8 if length.max() <= 8 else 64
@@ -158,12 +158,14 @@ def _blf_frames(stream: bytes, objects: np.ndarray, kind: int) -> Iterator[tuple
         if kind == _FD64:
             room = np.where(text[:, header + 35] > 0, text[:, header + 35], these[:, 2]) - header - 40
             bus, remote = text[:, header], number(header + 12, 4) & 0x10
-            length = np.clip(np.minimum(text[:, header + 2], room), 0, 64)
+            length = np.where(room < 0, 0, np.minimum(text[:, header + 2], 64))
         else:
             bus, remote = number(header, 2), text[:, header + 2] & 0x80
             length = np.minimum(text[:, header + 14], 64) if kind == _FD else np.minimum(text[:, header + 3], 8)
         data = text[:, at : at + (8 if kind in (_CAN, _CAN2) else 64)].copy()
-        data[np.arange(data.shape[1]) >= length[:, None]] = 0
+        # of an FD64 object zeros at the end of the frame need not be stored
+        stored = np.minimum(length, room) if kind == _FD64 else length
+        data[np.arange(data.shape[1]) >= stored[:, None]] = 0
         keep = remote == 0
         ns = (ticks * step).astype(np.int64)
         fields = these[:, 0], ns, ident & np.uint32(0x9FFFFFFF), bus.astype(np.int32), length.astype(np.uint8), data

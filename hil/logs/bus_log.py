@@ -33,7 +33,7 @@ class Bus:
         self.notes = notes + frames.notes
         self.names: dict[str, tuple[str, ...]] = {}
         self.comments: dict[str, str] = {}
-        self._of: dict[str, tuple[Message, Any]] = {}
+        self._of: dict[str, tuple[Message, list[Any]]] = {}
         self._silent: dict[str, str] = {}
         self._rows: dict[int, np.ndarray] = {}
         seen = np.unique(frames.ident)
@@ -41,40 +41,66 @@ class Bus:
         sent = set(seen.tolist())
         for m in messages:
             here = m.ident in sent or (m.ident >> 31 and int(pgn(m.ident & 0x1FFFFFFF)) in groups)
-            for s in m.layout.signals:
-                key = f"{m.layout.name}.{s.name}"
+            for key, branches in _by_name(m).items():
+                full, name = f"{m.layout.name}.{branches[0].name}", str(branches[0].name)
                 if here:
-                    self.names[key] = (key, s.name)
-                    self._of[key] = m, s
-                    self.comments[key] = str(s.comment or "")
+                    self.names[key] = tuple(dict.fromkeys((key, full, name)))
+                    self._of[key] = m, branches
+                    self.comments[key] = str(branches[0].comment or "")
                 else:
                     why = (
                         f"{dbc.name} has it in {m.layout.name} (0x{m.ident & 0x1FFFFFFF:X}), but the log has no "
                         f"such frame"
                     )
-                    self._silent[s.name] = self._silent[key] = why
+                    self._silent[name] = self._silent[full] = why
+        if frames.t.size and not self.names:
+            self.notes.append(self._unknown())
 
     def has(self) -> str:
         if self.names:
             return names_held(self.kind, self.names)
+        return f"; {self._unknown()}"
+
+    def _unknown(self) -> str:
+        """What is to be said of a database that knows none of the log's frames."""
         ident, count = np.unique(self.frames.ident & 0x1FFFFFFF, return_counts=True)
         most = ", ".join(f"0x{i:X}" for i in ident[np.argsort(-count)][:8]) + (", ..." if ident.size > 8 else "")
-        return f"; {self.dbc.name} has no message for the log's {ident.size} identifiers ({most}): --dbc F"
+        return f"{self.dbc.name} has no message for the log's {ident.size} identifiers ({most}): --dbc F"
 
     def absent(self, name: str) -> str:
         return self._silent.get(name, "")
 
     def series(self, key: str) -> Series:
-        m, signal = self._of[key]
+        m, branches = self._of[key]
         if m.ident not in self._rows:
             self._rows[m.ident], notes = select(self.frames, m)
             self.notes += notes
-        rows, values, missing = cut_signal(self.frames, self._rows[m.ident], m, signal)
+        parts = [cut_signal(self.frames, self._rows[m.ident], m, signal) for signal in branches]
+        rows, values, missing = parts[0][0], parts[0][1], sum(p[2] for p in parts)
+        if len(parts) > 1:  # each frame carries one branch
+            rows, at = np.unique(np.concatenate([p[0] for p in parts]), return_index=True)
+            values = np.concatenate([p[1] for p in parts])[at]
         if missing and not rows.size:
-            self._silent[key] = self._silent[str(signal.name)] = f"all {missing} frames say not available"
+            self._silent[key] = self._silent[str(branches[0].name)] = f"all {missing} frames say not available"
         elif missing:
             self.notes.append(f"{key}: {missing} frames say not available: left out")
-        return Series(self.frames.t[rows], values, str(signal.unit or ""), framed=True)
+        return Series(self.frames.t[rows], values, str(branches[0].unit or ""), framed=True)
+
+
+def _by_name(message: Message) -> dict[str, list[Any]]:
+    """Signals of a message by the name under which they are offered.
+
+    A name that several branches of a multiplexed message carry is one signal, unless they carry it in several units.
+    """
+    found: dict[str, list[Any]] = {}
+    for s in message.layout.signals:
+        found.setdefault(f"{message.layout.name}.{s.name}", []).append(s)
+    out: dict[str, list[Any]] = {}
+    for key, same in found.items():
+        for s in same:
+            branch = f" ({s.multiplexer_signal}={', '.join(map(str, s.multiplexer_ids or ()))})"
+            out.setdefault(key + branch * (len({x.unit for x in same}) > 1), []).append(s)
+    return out
 
 
 def open_bus_log(frames: Frames, options: Options) -> Bus:

@@ -15,11 +15,18 @@ from vaneloop.base.files import whole
 __all__ = ["read_candump", "write_candump"]
 
 # `candump -l`: (1735329625.329586) can0 17C#0000000010000021, ids of 3 or 8 digits, #R remote, ##f CAN FD with flags f,
-# direction behind; and the console form `candump -ta`: (1735329625.329586)  can0  17C   [8]  00 00 00 00 10 00 00 21
+# direction behind; and the console form `candump -ta` or `-tz`, a blank before it, with `-a` text behind:
+#  (1735329625.329586)  can0  17C   [8]  00 00 00 00 10 00 00 21   '.......!'
 _CANDUMP = re.compile(
-    rb"\((?P<s>\d{1,10})\.(?P<f>\d{1,9})\)\s+(?P<bus>[^\s#]{1,20})\s+(?:[RT]X\s+\S\s+\S\s+)?(?P<id>[0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})"
+    rb" ?\((?P<s>\d{1,10})\.(?P<f>\d{1,9})\)\s+(?P<bus>[^\s#]{1,20})\s+(?:[RT]X\s+\S\s+\S\s+)?"
+    rb"(?P<id>[0-9A-Fa-f]{8}|[0-9A-Fa-f]{3})"
     rb"(?P<form>##(?P<flags>[0-9A-Fa-f])|#|\s+\[\s?\d{1,2}\]\s*)(?P<remote>R[0-9A-Fa-f]?|remote request)?"
-    rb"(?P<d>(?: ?[0-9A-Fa-f]{2}){0,64})(?:_[0-9A-Fa-f])?(?:\s+[RTrt][xX]?)?[ \t]*\Z"
+    rb"(?P<d>(?: ?[0-9A-Fa-f]{2}){0,64})(?:_[0-9A-Fa-f])?(?:\s+[RTrt][xX]?)?[ \t]*"
+    rb"(?P<tail>(?:'[^\n]{0,64}'|ERRORFRAME)?[ \t]*)\Z"
+)
+_NO_SECONDS = (
+    (re.compile(rb"^ ?\(\d{4}-\d\d-\d\d ", re.M), "its times are dates (candump -tA)"),
+    (re.compile(rb"^ *[^\s(#\[]{1,20} +(?:[RT]X\s+\S\s+\S\s+)?[0-9A-Fa-f]{3,8} +\[", re.M), "its lines have no time"),
 )
 # `candump -d` says what the socket's queue could not hold
 _DROPCOUNT = re.compile(rb"^DROPCOUNT: dropped (?P<n>\d{1,10}) CAN frames? on '(?P<bus>[^'\n]{1,20})' socket", re.M)
@@ -31,7 +38,7 @@ def read_candump(path: Path) -> Frames:
     buses: dict[bytes, int] = {}
     bad = special = 0
     raw = read_bytes(path)
-    for lines in match_lines(raw, _CANDUMP, b"("):
+    for lines in match_lines(raw, _CANDUMP, b"( "):
         if isinstance(lines, int):
             bad += lines
             continue
@@ -62,6 +69,8 @@ def read_candump(path: Path) -> Frames:
     ]
     if special:
         notes.append(f"{special} remote or error frames: left out")
+    if not parts and (what := next((what for kind, what in _NO_SECONDS if kind.search(raw)), "")):
+        raise LogError(f"{path}: {what}; allowed: seconds (candump -l, or -ta on the console)")
     return join_parts(path, parts, "candump", "(1735329625.329586) can0 17C#0000000010000021", notes)
 
 

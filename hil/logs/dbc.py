@@ -56,7 +56,7 @@ def _load_dbc(path: str, raw: bytes) -> tuple[list[Message], list[str]]:
     import cantools
 
     kind = Path(path).suffix.lower().lstrip(".")
-    text = raw.decode("utf-8-sig" if raw.startswith(b"\xef\xbb\xbf") else "cp1252", errors="replace")
+    text = _decoded(raw)
     if kind in ("arxml", "kcd", "sym"):
         tries = [(text, False, "")]
     else:
@@ -77,6 +77,28 @@ def _load_dbc(path: str, raw: bytes) -> tuple[list[Message], list[str]]:
             continue
         return messages, [f"{path}: read {lost} ({reason})"] if lost else []
     raise LogError(f"{path}: is not a database that cantools reads ({reason})")
+
+
+def _decoded(raw: bytes) -> str:
+    """The text of a database, which does not say how it is encoded: UTF-16 by its mark, UTF-8, else cp1252 as Vector's
+    editors write it.
+
+    A file that several editors have changed may hold lines of both kinds.
+    """
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return raw.decode("utf-16", errors="replace")
+    raw = raw.removeprefix(b"\xef\xbb\xbf")
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError:
+        return "".join(map(_line_decoded, raw.splitlines(keepends=True)))
+
+
+def _line_decoded(line: bytes) -> str:
+    try:
+        return line.decode("utf-8")
+    except UnicodeDecodeError:
+        return line.decode("cp1252", errors="replace")
 
 
 def _without(text: str, gone: list[str]) -> str:

@@ -27,7 +27,10 @@ if TYPE_CHECKING:
     from hil.logs.record_formats import FramesOfRecord, RecordFormat
     from hil.logs.source import Channel, Options, Source
 
-__all__ = ["FORMATS", "GROUP", "OURS", "Format", "format_of", "is_framed", "listed", "spoken", "suffixes", "with_part"]
+__all__ = [
+    "FORMATS", "GROUP", "OURS", "Format", "format_at", "format_of", "is_framed", "listed", "spoken", "suffixes",
+    "with_part",
+]  # fmt: skip
 
 GROUP = "vaneloop.log_formats"
 _SUFFIX = re.compile(r"\.[a-z0-9_+-]{1,20}")  # as a script of `vaneloop completion` can hold it
@@ -49,7 +52,8 @@ class Format:
     suffixes    how its files' names end, with the point
     about       what it is, and which of its kinds are read
     names       what the names in it are
-    begins      what a file of it begins with, one of these; empty where nothing marks it
+    begins      what a file of it begins with, one of these; empty where nothing marks it. Of formats that share a
+                suffix all but one have it
     framed      it may hold frames of a bus, for which there is a database
     packed      its files are compressed
     extra       of VaneLoop, that it needs (`vaneloop.base.extras`)
@@ -144,6 +148,19 @@ OURS = (
         recorder="hil.logs.record_formats:CandumpRecord", recording="hil.logs.recordings:read_candump",
     ),
     Format(
+        "BUSMASTER", (".log",), "BUSMASTER log in `HEX`, a file that begins with `***BUSMASTER`", names=_SIGNALS,
+        begins=(b"***BUSMASTER",), framed=True, frames="hil.logs.tool_traces:read_busmaster",
+    ),
+    Format(
+        "Microchip CAN BUS Analyzer", (".can", ".log"), "log of Microchip's CAN BUS Analyzer, a file that begins with "
+        "`//---`",
+        names=_SIGNALS, begins=(b"//---",), framed=True, frames="hil.logs.tool_traces:read_microchip",
+    ),
+    Format(
+        "CRTD", (".crtd", ".crt"), "CRTD of the Open Vehicle Monitoring System", names=_SIGNALS, framed=True,
+        frames="hil.logs.tool_traces:read_crtd",
+    ),
+    Format(
         "Vector ASCII", (".asc",), "Vector ASCII, classic and FD, `base hex`, times absolute or relative",
         names=_SIGNALS, begins=(b"date ",), framed=True,
         frames="hil.logs.asc:read_asc", frames_out="hil.logs.through_can:write_asc",
@@ -162,6 +179,14 @@ OURS = (
         recording="hil.logs.recordings:read_text",
     ),
     Format(
+        "CANHacker", (".trc",), "CANHacker trace, a file that begins with `Time   ID     DLC`", names=_SIGNALS,
+        begins=(b"Time   ID ", b"CANHacker"), framed=True, frames="hil.logs.tool_traces:read_canhacker",
+    ),
+    Format(
+        "CARBUS Analyzer", (".trc",), "CARBUS Analyzer trace, versions 2 and 3, a file that begins with `@ TEXT @`",
+        names=_SIGNALS, begins=(b"@ TEXT @",), framed=True, frames="hil.logs.tool_traces:read_carbus",
+    ),
+    Format(
         "MDF4", (".mf4",), "MDF 4: CAN bus logging, or channel groups; found out from the content",
         names=f"{_SIGNALS}, or channels", begins=(b"MDF     4", b"UnFinMF 4"), framed=True, packed=True, extra="mdf",
         source="hil.logs.mdf:open_mdf", channels="hil.logs.mdf_write:write_mdf",
@@ -176,13 +201,11 @@ OURS = (
         recording="hil.logs.recordings:read_text",
     ),
     Format(
-        "Megasquirt log", (".msl",), "as written by TunerStudio and MegaLogViewer: a CSV with tabs",
-        names="columns", source="hil.logs.csv_format:open_csv", channels="hil.logs.csv_format:write_msl",
-    ),
-    Format(
-        "LabVIEW measurement", (".lvm",), "one time for all channels or one for each, or none but the step",
-        names="columns", begins=(b"LabVIEW Measurement",),
-        source="hil.logs.csv_format:open_csv", channels="hil.logs.csv_format:write_lvm",
+        "frames in CSV", (".csv",), "a row a frame, as SavvyCAN and GVRET, CANedge or python-can write it; told by the "
+        "header",
+        names=_SIGNALS,
+        begins=(b"Time Stamp,ID,Extended,", b"TimestampEpoch;BusChannel;ID;IDE;", b"timestamp,arbitration_id,"),
+        framed=True, frames="hil.logs.tool_traces:read_csv_frames", recording="hil.logs.recordings:read_text",
     ),
     Format(
         "Parquet", (".parquet",), "flat, numeric columns; time may be a timestamp",
@@ -192,7 +215,9 @@ OURS = (
         said="hil.logs.parquet_format:said_by_parquet",
     ),
 )  # fmt: skip
-FORMATS: dict[str, Format] = {suffix: f for f in OURS for suffix in f.suffixes}  # ours by suffix
+FORMATS: dict[str, Format] = {  # those of ours that are written, too, by suffix
+    suffix: f for f in OURS if f.channels or f.frames_out for suffix in f.suffixes
+}
 
 
 # --- formats of other packages ----------------------------------------------------------------------------------------
@@ -203,7 +228,7 @@ def _foreign() -> dict[str, metadata.EntryPoint]:
     found: dict[str, metadata.EntryPoint] = {}
     for entry in metadata.entry_points(group=GROUP):
         suffix = "." + entry.name.lower().removeprefix(".")
-        if suffix not in FORMATS and _SUFFIX.fullmatch(suffix):
+        if not any(suffix in f.suffixes for f in OURS) and _SUFFIX.fullmatch(suffix):
             found.setdefault(suffix, entry)
     return found
 
@@ -268,7 +293,7 @@ def _clear_source(source: Any, whose: str) -> Any:
 
 def suffixes() -> tuple[str, ...]:
     """Suffixes of all logs, ours first. No package is loaded for it."""
-    return (*FORMATS, *_foreign())
+    return (*dict.fromkeys(s for f in OURS for s in f.suffixes), *_foreign())
 
 
 def with_part(part: str) -> list[Format]:
@@ -282,7 +307,7 @@ def with_part(part: str) -> list[Format]:
 
 def listed(formats: Iterable[Format]) -> str:
     """Suffixes in words: ``.log, .blf, .mf4``."""
-    return ", ".join(s for f in formats for s in f.suffixes)
+    return ", ".join(dict.fromkeys(s for f in formats for s in f.suffixes))
 
 
 def spoken(formats: Iterable[Format]) -> str:
@@ -299,7 +324,7 @@ def format_of(
     Raises LogError where there is none: what the suffix is or is not (``says``), and the allowed ones (``tell``).
     """
     suffix = path.suffix.lower()
-    found = FORMATS.get(suffix)
+    found = FORMATS.get(suffix) or next((f for f in OURS if suffix in f.suffixes), None)
     if found is None and (entry := _foreign().get(suffix)) is not None:
         found = _loaded(path, suffix, entry)
     if found is None or (part and getattr(found, part) is None):
@@ -308,18 +333,32 @@ def format_of(
     return found
 
 
+def format_at(path: Path, part: str = "", says: str = "is not a log's") -> Format:
+    """The format of a file that is there: as of `format_of`, and where formats share the suffix, by how it begins."""
+    alike = [f for f in OURS if path.suffix.lower() in f.suffixes]
+    head = _head(path) if len(alike) > 1 else b""
+    found = next((f for f in alike if head.startswith(f.begins)), None)
+    told = found is not None and (not part or getattr(found, part) is not None)
+    return found if found is not None and told else format_of(path, part, says)
+
+
 def is_framed(path: Path) -> bool:
-    """Whether a file may hold frames of a bus, by its suffix."""
+    """Whether a file may hold frames of a bus."""
     with contextlib.suppress(LogError):
-        return format_of(path).framed
+        return format_at(path).framed
     return False
+
+
+def _head(path: Path) -> bytes:
+    """How a file begins, behind the mark of UTF-8; empty where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(64).removeprefix(b"\xef\xbb\xbf") if path.is_file() else b""
+    except (OSError, ValueError):
+        return b""
 
 
 def _told(path: Path) -> str:
     """What the content of a file says, whose suffix says nothing."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(64) if path.is_file() else b""
-    except (OSError, ValueError):
-        return ""
+    head = _head(path)
     return next((f"; it begins as {f.name} does ({f.suffixes[0]})" for f in OURS if head.startswith(f.begins)), "")

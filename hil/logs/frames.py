@@ -55,6 +55,13 @@ def in_order(name: str, t: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np
         raise LogError(f"{name}: time of frame {int(np.argmin(np.isfinite(t))) + 1} is not a number")
     if not t.size or (np.diff(t) >= 0).all():
         return t, slice(None)
+    falls = int(np.count_nonzero(np.diff(t) < 0))
+    steps = (
+        f"{name}: time runs backwards at {falls} of {t.size} frames; it must count from one start (not from frame to "
+        f"frame)"
+    )
+    if falls > 0.01 * t.size and t.size > 10 and _stands(t):
+        raise LogError(steps)
     back = np.maximum.accumulate(t) - t
     worst = int(np.argmax(back))
     if back[worst] > DISORDER_S and (wrong := plausible.out_of_order(t, DISORDER_S)) is not None:
@@ -68,16 +75,19 @@ def in_order(name: str, t: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np
     if back[worst] > DISORDER_S:
         limit = f"allowed: up to {DISORDER_S * 1e3:g} ms (sorted)"
         raise LogError(f"{name}: time runs backwards by {back[worst]:.6g} s at frame {worst + 1}; {limit}")
-    falls = int(np.count_nonzero(np.diff(t) < 0))
     if falls > 0.3 * t.size and t.size > 10:
-        raise LogError(
-            f"{name}: time runs backwards at {falls} of {t.size} frames; it must count from one start (not from frame "
-            f"to frame)"
-        )
+        raise LogError(steps)
     notes.append(
         f"{int(np.count_nonzero(back > 0))} frames out of order by up to {back[worst] * 1e3:.3g} ms: sorted by time"
     )
     return t, np.argsort(t, kind="stable")
+
+
+def _stands(t: np.ndarray) -> bool:
+    """Whether the times of a log do not grow on the whole, as those from frame to frame do not."""
+    low, high = np.quantile(t, [0.1, 0.9])
+    half = t.size // 2
+    return bool(np.median(t[half:]) - np.median(t[:half]) <= 0.1 * (high - low))
 
 
 def frames_in_order(

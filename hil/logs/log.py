@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from hil.logs import plausible
-from hil.logs.formats import format_of
+from hil.logs.formats import format_at, format_of
 from hil.logs.guess import Files, Guess
 from hil.logs.opening import Opened, is_ours, open_log, sketch, wanted_design_speed
 from hil.logs.scale import proposed_scale
@@ -224,7 +224,8 @@ def read_log(
         try:
             taken = _take(path, source, signal, name, signal in named, signal in require, notes)
         except LogError as e:
-            raise e if str(e).startswith(str(path)) else LogError(f"{path}: {e}") from None
+            whole = str(e) if str(e).startswith(str(path)) else f"{path}: {e}"
+            raise LogError("; ".join(filter(None, (whole, log.unused)))) from None
         if taken is not None:
             key, s = taken
             with np.errstate(all="ignore"):  # what overflows is not finite and left out below
@@ -252,7 +253,8 @@ def read_log(
             reason = "; ".join(source.notes[said[0] :] + notes[said[1] :]) or source.absent(name)
             reason = "; ".join(filter(None, (reason, log.guesses.open.get(signal), log.absent.get(signal))))
             asked = f"looked for {source.kind} {name!r}" + (f" ({reason})" if reason else "")
-            raise LogError(f"{path}: {found} {signal}: {asked}; --map NAME={signal} names another{source.has()}")
+            line = f"{path}: {found} {signal}: {asked}; --map NAME={signal} names another{source.has()}"
+            raise LogError("; ".join(filter(None, (line, log.unused))))
     _refuse_units(path, wrong)
     channels = _one_run(path, channels, require, notes)
     _shift(channels, notes, "1900" if units.get("t") == "day" else "1970")
@@ -338,7 +340,7 @@ def offered(path: str | Path, *, dbc: str | Path | None = None) -> list[str]:
     """Names that a log offers and that ``mapping`` may name. Raises LogError for a file that is no log."""
     path = Path(path)
     try:
-        source = format_of(path).open(path, Options(Path(dbc) if dbc is not None else None, {}))
+        source = format_at(path).open(path, Options(Path(dbc) if dbc is not None else None, {}))
     except NoTime as e:
         return [h for h in e.headers if h]
     time = getattr(source, "time", None)  # a table's time column is a column like any other

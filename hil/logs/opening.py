@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from hil.logs import plausible
-from hil.logs.formats import format_of
+from hil.logs.formats import format_at
 from hil.logs.guess import Files, Guess, Guesses, design_speed, withdrawn
 from hil.logs.guess import guess as guess_names
 from hil.logs.mapping import Bench, read_mapping
@@ -77,6 +77,7 @@ class Opened:
     units    signal -> unit in the log, where the user, a mapping file or a guess says it
     absent   signals of the mapping file that the log does not have
     tables   of the machine, that a guess is held against
+    unused   what is to be said of a database that the user names in vain
     """
 
     source: Source
@@ -89,6 +90,7 @@ class Opened:
     dbc: Path | None
     absent: dict[str, str]
     tables: Files
+    unused: str = ""
 
 
 def open_log(
@@ -111,15 +113,16 @@ def open_log(
     _known_units(path, units or {}, signals)
     given = _pairs(path, mapping, signals)
     named = {**bench.names, **given}
-    by_name = {name: signal for signal, name in named.items()}
-    options = Options(Path(dbc) if dbc is not None else None, by_name, guess, part)
-    source = format_of(path).open(path, options)
-    if part and not isinstance(source, Table):
-        raise LogError(f"{path}: part {part}: only tables have parts")
+    options = Options(Path(dbc) if dbc is not None else None, {name: signal for signal, name in named.items()}, guess)
+    source = format_at(path).open(path, options)
     absent = {s: n for s, n in bench.names.items() if s not in given and s != "t" and not find(source, n, True)}
     for signal in absent:
         del named[signal]
     notes = [f"{s}: {mapping_file} calls it {n!r}, which the log does not have" for s, n in absent.items()]
+    unused = ""
+    if options.dbc is not None and not hasattr(source, "frames"):
+        unused = f"{options.dbc}: not used, as the log holds no frames of a bus"
+        notes.append(unused)
     keys = {s: find(source, named.get(s, s), s in named) for s in signals}
     out = Opened(
         source,
@@ -132,6 +135,7 @@ def open_log(
         options.dbc,
         absent,
         tables,
+        unused,
     )
     _units_of_names(out, signals, guess)
     if guess:

@@ -51,11 +51,12 @@ def select(frames: Frames, message: Message) -> tuple[np.ndarray, list[str]]:
         rows = rows[source == best]
     short = frames.length[rows] < message.layout.length
     if short.any():
-        notes.append(
-            f"{name}: {int(short.sum())} of {rows.size} frames are shorter than its {message.layout.length} bytes: "
-            f"left out"
-        )
-        rows = rows[~short]
+        what = f"{int(short.sum())} of {rows.size} frames are shorter than its {message.layout.length} bytes"
+        if message.e2e is None:
+            notes.append(f"{name}: {what}: read as far as they reach")
+        else:  # its CRC is over all of them
+            notes.append(f"{name}: {what}: left out")
+            rows = rows[~short]
     if message.e2e is not None and rows.size:
         if message.layout.length == 8 and frames.data.shape[1] == 8:
             wrong = np.empty(rows.size, bool)

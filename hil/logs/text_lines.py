@@ -2,8 +2,8 @@
 
 Lines that have equal length nearly always have equal columns. So the first line of a length gives the columns (by a
 regular expression), all lines that agree with it are parsed as one matrix, and the others take the next round. In the
-expressions the groups s, f, n are decimal digits (s, n with the blanks that pad them), id, d, flags are hex digits
-(with the blanks between bytes), tail is free; all else is fixed in a round.
+expressions the groups h, m, s, f, n are decimal digits (s, n with the blanks that pad them), id, d, flags are hex
+digits (with the blanks, commas or semicolons between bytes), tail is free; all else is fixed in a round.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from hil.logs.source import LogError
 
 __all__ = ["Lines", "Part", "join_parts", "match_lines", "part_of"]
 
-_DECIMAL, _HEX = ("s", "f", "n"), ("id", "d", "flags")
+_DECIMAL, _HEX = ("h", "m", "s", "f", "n"), ("id", "d", "flags")
+_BETWEEN = b" \t,;"  # bytes of data
 _ROUNDS = 24  # per line length; lines left over are sorted into layouts one by one
 _BLOCK = 4096  # lines turned into columns at a time: 200 kB stay in the cache
 _LONGEST = 600  # bytes of a line; CAN FD with everything behind it stays below
@@ -68,7 +69,7 @@ class Lines:
     def data(self, most: int) -> np.ndarray:
         """Bytes of the group d, at most ``most``: uint8[n, w]."""
         d0, d1 = self.match.span("d")
-        places = [k for k in range(d0, d1) if self.match.string[k] not in b" \t"][: 2 * most]
+        places = [k for k in range(d0, d1) if self.match.string[k] not in _BETWEEN][: 2 * most]
         out = np.empty((self.start.size, len(places) // 2), np.uint8)
         for k in range(out.shape[1]):
             out[:, k] = _NIBBLE[self.columns[places[2 * k]]] << 4 | _NIBBLE[self.columns[places[2 * k + 1]]]
@@ -85,7 +86,7 @@ def _fit(columns: np.ndarray, m: re.Match[bytes]) -> np.ndarray:
         at, end = m.span(group) if group in m.re.groupindex else (0, 0)
         padded = group in "sn"
         for k in range(at, end):
-            if group in _HEX and line[k] in b" \t":
+            if group in _HEX and line[k] in _BETWEEN:
                 continue
             free[k] = True
             c = columns[k]

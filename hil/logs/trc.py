@@ -24,7 +24,7 @@ _TRC_COLUMNS = {
     b"2.1": "OTBIdRLD",
 }
 _TRC_WORD = {
-    "O": rb"(?P<s> *\d{1,15})(?:\.(?P<f>\d{1,6}))?", "T": rb"(?:DT|FD|FB|FE|BI)", "B": rb"(?P<bus>\d{1,3})",
+    "O": rb"(?P<s> *\d{1,15})(?:[.,](?P<f>\d{1,6}))?", "T": rb"(?:DT|FD|FB|FE|BI)", "B": rb"(?P<bus>\d{1,3})",
     "I": rb"(?P<id>[0-9A-Fa-f]{3,8})", "d": rb"(?:Rx|Tx)", "R": rb"\S+", "L": rb"(?P<len>\d{1,2})(?![ "
                                                                               rb"\t]+RTR)", "l": rb"(?P<len>\d{1,2})",
 }  # fmt: skip

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.logs import Channel, write_log
-from hil.logs.formats import OURS, listed
+from hil.logs.formats import FORMATS, listed
 from hil.loop.lockstep import warm_up
 from hil.native import Program, crash_log
 from hil.native.crash_log import is_crash_log
@@ -55,7 +55,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "other figures",
     )
     terminal.add_output_options(parser, report=True)
-    parser.add_argument("--out", metavar="F", help=f"write the simulated run as a log ({listed(OURS)})")
+    parser.add_argument("--out", metavar="F", help=f"write the simulated run as a log ({listed(FORMATS.values())})")
 
 
 @options.guarded
