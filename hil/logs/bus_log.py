@@ -14,6 +14,7 @@ from hil.logs.dbc import Message, load_dbc
 from hil.logs.frames import Frames
 from hil.logs.signals import cut_signal, encode, pgn, select
 from hil.logs.source import Channel, LogError, Options, Series, names_held
+from hil.logs.transport import put_together
 from vaneloop.base import tables
 
 __all__ = ["Bus", "encode_channels", "open_bus_log"]
@@ -35,8 +36,10 @@ class Bus:
         self.comments: dict[str, str] = {}
         self._of: dict[str, tuple[Message, list[Any]]] = {}
         self._silent: dict[str, str] = {}
-        self._rows: dict[int, np.ndarray] = {}
-        seen = np.unique(frames.ident)
+        self._rows: dict[int, tuple[Frames, np.ndarray]] = {}
+        self._long, said = put_together(frames, messages)
+        self.notes += said
+        seen = np.unique(frames.ident if self._long is None else np.concatenate((frames.ident, self._long.ident)))
         groups = set(pgn(seen[seen >> 31 == 1]).tolist())
         sent = set(seen.tolist())
         for m in messages:
@@ -73,9 +76,9 @@ class Bus:
     def series(self, key: str) -> Series:
         m, branches = self._of[key]
         if m.ident not in self._rows:
-            self._rows[m.ident], notes = select(self.frames, m)
-            self.notes += notes
-        parts = [cut_signal(self.frames, self._rows[m.ident], m, signal) for signal in branches]
+            self._rows[m.ident] = self._select(m)
+        frames, of = self._rows[m.ident]
+        parts = [cut_signal(frames, of, m, signal) for signal in branches]
         rows, values, missing = parts[0][0], parts[0][1], sum(p[2] for p in parts)
         if len(parts) > 1:  # each frame carries one branch
             rows, at = np.unique(np.concatenate([p[0] for p in parts]), return_index=True)
@@ -84,7 +87,16 @@ class Bus:
             self._silent[key] = self._silent[str(branches[0].name)] = f"all {missing} frames say not available"
         elif missing:
             self.notes.append(f"{key}: {missing} frames say not available: left out")
-        return Series(self.frames.t[rows], values, str(branches[0].unit or ""), framed=True)
+        return Series(frames.t[rows], values, str(branches[0].unit or ""), framed=True)
+
+    def _select(self, m: Message) -> tuple[Frames, np.ndarray]:
+        """Frames and the rows of them that carry a message: those put together by a transport protocol, if any do."""
+        for frames in filter(None, (self._long if m.layout.length > 8 else None, self.frames)):
+            rows, notes = select(frames, m)
+            if rows.size or frames is self.frames:
+                self.notes += notes
+                break
+        return frames, rows
 
 
 def _by_name(message: Message) -> dict[str, list[Any]]:

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 
 import asammdf  # before the limit: its own libraries count for little, but take address space
 import numpy as np
-from asammdf.blocks.v4_constants import SOURCE_BUS
+from asammdf.blocks.v4_constants import CHANNEL_TYPE_VIRTUAL, CHANNEL_TYPE_VIRTUAL_MASTER, SOURCE_BUS
 
 from hil.logs.frames import EXTENDED
 from hil.logs.names import meaning
@@ -128,7 +128,11 @@ def _bus_columns(mdf: Any, g: int, names: list[str]) -> list[np.ndarray]:
     """t, identifier, bus, length and bytes of the data frames of one channel group."""
 
     def column(name: str) -> Any:
-        return mdf.get(f"{_BUS}.{name}", group=g, raw=True, ignore_invalidation_bits=True)
+        s = mdf.get(f"{_BUS}.{name}", group=g, raw=True, ignore_invalidation_bits=True)
+        kind = mdf.groups[g].channels[names.index(f"{_BUS}.{name}")].channel_type
+        # it has no bytes in the record: its raw value is the record's number, and its conversion says the value
+        virtual = kind in (CHANNEL_TYPE_VIRTUAL, CHANNEL_TYPE_VIRTUAL_MASTER)
+        return s.physical(ignore_value2text_conversions=True) if virtual else s
 
     ident_signal, data = column("ID"), column("DataBytes").samples
     ident = ident_signal.samples.astype(np.uint32)

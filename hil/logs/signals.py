@@ -52,9 +52,11 @@ def select(frames: Frames, message: Message) -> tuple[np.ndarray, list[str]]:
     short = frames.length[rows] < message.layout.length
     if short.any():
         what = f"{int(short.sum())} of {rows.size} frames are shorter than its {message.layout.length} bytes"
-        if message.e2e is None:
+        # bytes of a transport protocol, of which nothing could be put together, are no signals
+        carried = message.layout.length > 8 and int(frames.length[rows].max()) <= 8
+        if message.e2e is None and (not carried or message.layout.is_multiplexed()):
             notes.append(f"{name}: {what}: read as far as they reach")
-        else:  # its CRC is over all of them
+        else:  # a CRC is over all of them
             notes.append(f"{name}: {what}: left out")
             rows = rows[~short]
     if message.e2e is not None and rows.size:
