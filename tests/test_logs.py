@@ -522,7 +522,7 @@ def test_a_blf_object_of_size_zero_and_a_boasting_container_are_survived(tmp_pat
             + bytes(4)
         )
         (tmp_path / "a.blf").write_bytes(head + container + body)
-        assert "no CAN frame" in refused(tmp_path / "a.blf")
+        assert "no CAN data frame" in refused(tmp_path / "a.blf")
 
 
 # --- names ------------------------------------------------------------------------------------------------------------

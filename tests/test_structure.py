@@ -98,6 +98,7 @@ LATE: dict[str, dict[str, str]] = {
     },
     "vaneloop/__init__.py": {"vaneloop.base.version": "start-up: 30 ms"},
     "vaneloop/cli/main.py": {"vaneloop.base.version": "start-up: 30 ms"},
+    "vaneloop/cli/map.py": {"hil.logs.others": "start-up: 150 ms"},
     "vaneloop/design/multibody.py": {
         "exudyn": "extra multibody",
         "exudyn.itemInterface": "extra multibody",

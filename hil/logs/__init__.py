@@ -3,11 +3,14 @@
 log              `read_log`, `write_log`
 formats          the one list of all formats, and those of other packages
 source           what a format gives and takes
-csv_format, parquet_format, mdf, candump, asc, blf, trc
-                 the formats, one file each; table, dates, arrow, text_lines and frames hold what several have in common
+csv_format, parquet_format, mdf, candump, asc, blf, trc, tool_traces
+                 the formats, one file each but for the text traces of further tools; table, dates, arrow, text_lines
+                 and frames hold what several have in common
 through_can, mdf_write, mdf_child
                  what python-can and asammdf write, and the process that opens an MDF4 file
-bus_log          a log of frames seen through a database (dbc); signals are cut out of frames in signals and columns
+bus_log          a log of frames seen through a database (dbc); signals are cut out of frames in signals and columns,
+                 longer messages put together in transport
+others           what python-can, cantools and asammdf find in a log
 opening          which name of a log is which signal: stated, in a mapping file (mapping), or guessed
 names, guess, times
                  what a name says; which guess is made; the time of a table

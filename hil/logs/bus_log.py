@@ -74,10 +74,7 @@ class Bus:
         return self._silent.get(name, "")
 
     def series(self, key: str) -> Series:
-        m, branches = self._of[key]
-        if m.ident not in self._rows:
-            self._rows[m.ident] = self._select(m)
-        frames, of = self._rows[m.ident]
+        m, branches, frames, of = self.carried(key)
         parts = [cut_signal(frames, of, m, signal) for signal in branches]
         rows, values, missing = parts[0][0], parts[0][1], sum(p[2] for p in parts)
         if len(parts) > 1:  # each frame carries one branch
@@ -88,6 +85,13 @@ class Bus:
         elif missing:
             self.notes.append(f"{key}: {missing} frames say not available: left out")
         return Series(frames.t[rows], values, str(branches[0].unit or ""), framed=True)
+
+    def carried(self, key: str) -> tuple[Message, list[Any], Frames, np.ndarray]:
+        """The message and the signals of it that ``key`` names, and the rows of the frames that carry it."""
+        m, branches = self._of[key]
+        if m.ident not in self._rows:
+            self._rows[m.ident] = self._select(m)
+        return m, branches, *self._rows[m.ident]
 
     def _select(self, m: Message) -> tuple[Frames, np.ndarray]:
         """Frames and the rows of them that carry a message: those put together by a transport protocol, if any do."""

@@ -28,7 +28,7 @@ from vaneloop.base.child import python
 from vaneloop.base.extras import needs
 from vaneloop.base.signals import UNITS
 
-__all__ = ["Groups", "open_mdf", "read_mdf", "read_record_mdf"]
+__all__ = ["Groups", "open_mdf", "read_as_others", "read_mdf", "read_record_mdf"]
 
 _TIME = 20, 1e6  # s of a processor, and bytes of file per further second
 _BUSY = 20  # times as long by the wall clock: others may have the processors, too
@@ -82,6 +82,13 @@ def read_mdf(path: Path, wanted: list[str], guess: bool = False) -> tuple[dict[s
         t, ident, bus, length, data = (arrays[f"b{i}.{k}"] for k in range(5))
         parts.append((*in_order(str(path), t, notes := []), ident, bus, length, data, notes))  # type: ignore[var-annotated]
     return {**{k: reply[k] for k in ("names", "comments", "why")}, "series": series}, _merge(parts)
+
+
+def read_as_others(path: Path, request: dict[str, Any]) -> dict[str, np.ndarray]:
+    """The frames of an MDF4 file as python-can reads them (``frames``), or t0, v0, t1, ... of the ``channels`` of these
+    keys as asammdf's own `get` gives them.
+    """
+    return _answered(path, request)[1]
 
 
 def read_record_mdf(path: Path) -> FramesOfRecord:

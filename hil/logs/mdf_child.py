@@ -11,6 +11,7 @@ import os
 import pkgutil
 import resource
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -26,6 +27,7 @@ __all__ = ["answer", "serve"]
 
 MEMORY = 1 << 30, 40  # bytes that may be taken beyond the start, and bytes more for each byte of the file
 RECORDING = "hil.logs.recordings:read_opened_mdf"  # loads the compiled code of the bus, which channels do without
+OTHERS = "hil.logs.others:by_python_can"
 _BUS = "CAN_DataFrame"
 _FRAMES = (
     "CAN_DataFrame",
@@ -61,6 +63,16 @@ def answer(request: bytes, out: BinaryIO) -> None:
         if asked.get("record"):
             reply = {}
             arrays.update(zip(("us", "rows", "sent"), pkgutil.resolve_name(RECORDING)(path), strict=True))
+        elif asked.get("frames"):
+            reply = {}
+            arrays.update(pkgutil.resolve_name(OTHERS)(path))
+        elif "channels" in asked:
+            reply = {}
+            with asammdf.MDF(path) as mdf:
+                places = {key: (g, i) for key, g, i, *_ in _found(mdf)}
+                for n, key in enumerate(asked["channels"]):
+                    s = mdf.get(group=places[key][0], index=places[key][1])
+                    arrays[f"t{n}"], arrays[f"v{n}"] = s.timestamps.astype(np.float64), s.samples.astype(np.float64)
         else:
             with asammdf.MDF(path, process_bus_logging=False) as mdf:  # type: ignore[call-arg]
                 reply = _read(mdf, asked["wanted"], asked["guess"], arrays)
@@ -81,27 +93,18 @@ def answer(request: bytes, out: BinaryIO) -> None:
 
 def _read(mdf: Any, wanted: list[str], guess: bool, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     """Names, wanted series and bus frames of an open file; numbers go to ``arrays``."""
-    found, buses = [], 0
+    buses = 0
     for g, group in enumerate(mdf.groups):
         names = [str(c.name) for c in group.channels]
-        if f"{_BUS}.ID" in names:
-            if group.channel_group.cycles_nr:
-                for k, a in enumerate(_bus_columns(mdf, g, names)):
-                    arrays[f"b{buses}.{k}"] = a
-                buses += 1
-            continue
-        master = mdf.masters_db.get(g)
-        label = str(group.channel_group.acq_name or "") or f"group{g}"
-        for i, name in enumerate(names):
-            if i != master and not name.startswith(_FRAMES):
-                found.append((g, i, name, label, master))
-    plain = [f[2] for f in found]
-    full = [f"{f[3]}.{f[2]}" for f in found]
+        if f"{_BUS}.ID" in names and group.channel_group.cycles_nr:
+            for k, a in enumerate(_bus_columns(mdf, g, names)):
+                arrays[f"b{buses}.{k}"] = a
+            buses += 1
+    found = _found(mdf)
     reply: dict[str, Any] = {"names": {}, "series": {}, "comments": {}, "why": {}, "buses": buses}
     fold = {w.casefold() for w in wanted}
-    for n, (g, i, name, label, master) in enumerate(found):
+    for n, (key, g, i, name, label, master) in enumerate(found):
         short = name.split("\\")[0]
-        key = name if plain.count(name) == 1 else full[n] if full.count(full[n]) == 1 else f"{g}.{name}"
         names = list(dict.fromkeys((key, name, short, f"{label}.{name}", f"{label}.{short}", f"{g}.{name}")))
         reply["names"][key] = names
         comment = str(mdf.groups[g].channels[i].comment or "")[:200] if guess else ""
@@ -122,6 +125,29 @@ def _read(mdf: Any, wanted: list[str], guess: bool, arrays: dict[str, np.ndarray
         reply["series"][key] = (n, str(s.unit or "")[:40], bool(source and source.source_type == SOURCE_BUS))
         arrays[f"t{n}"], arrays[f"v{n}"] = s.timestamps.astype(np.float64), s.samples.astype(np.float64)
     return reply
+
+
+def _found(mdf: Any) -> list[tuple[str, int, int, str, str, int | None]]:
+    """Channels that hold no frames: the key that names one alone, group, place in it, name, label of the group, place
+    of the group's time.
+    """
+    found = []
+    for g, group in enumerate(mdf.groups):
+        names = [str(c.name) for c in group.channels]
+        if f"{_BUS}.ID" in names:
+            continue
+        master = mdf.masters_db.get(g)
+        label = str(group.channel_group.acq_name or "") or f"group{g}"
+        for i, name in enumerate(names):
+            if i != master and not name.startswith(_FRAMES):
+                found.append((g, i, name, label, master))
+    plain = Counter(f[2] for f in found)
+    full = Counter(f"{f[3]}.{f[2]}" for f in found)
+
+    def key(g: int, name: str, label: str) -> str:
+        return name if plain[name] == 1 else f"{label}.{name}" if full[f"{label}.{name}"] == 1 else f"{g}.{name}"
+
+    return [(key(g, name, label), g, i, name, label, master) for g, i, name, label, master in found]
 
 
 def _bus_columns(mdf: Any, g: int, names: list[str]) -> list[np.ndarray]:

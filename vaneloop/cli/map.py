@@ -20,8 +20,10 @@ examples:
   vaneloop map examples/hidden_effect.parquet
   vaneloop map BENCH.csv --design-rpm 38000 --out bench.toml
   vaneloop replay BENCH.csv --mapping bench.toml
+  vaneloop map --check examples/engine_run.blf   # the same in python-can, cantools, asammdf?
 
-exit codes: 0 the log can be read so, 1 a line says what is missing, 2 bad input"""
+exit codes: 0 the log can be read so, 1 a line says what is missing or another reader finds something else, 2 bad
+input"""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -30,6 +32,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_tables_option(parser, plant=False)
     terminal.add_output_options(parser)
     parser.add_argument("--out", metavar="F.toml", help="write the mapping file")
+    parser.add_argument(
+        "--check", action="store_true", help="compare with what python-can, cantools and asammdf read of the log"
+    )
 
 
 def command(args: argparse.Namespace) -> int:
@@ -57,10 +62,22 @@ def command(args: argparse.Namespace) -> int:
             terminal.say(args, f"note: {note}")
     if seen.complaint:
         terminal.say(args, f"cannot be read so: {seen.complaint}")
-    terminal.write_json(args, seen.to_dict())
+    data, unlike = seen.to_dict(), False
+    if args.check:
+        from hil.logs.others import compare
+
+        found = compare(args.log, {r.signal: r.name for r in seen.rows if r.signal != "t"}, seen.dbc)
+        data["check"] = [c.to_dict() for c in found]
+        unlike = any(c.same is False for c in found)
+        words = {True: "yes", False: "NO", None: "-"}
+        terminal.print_table(
+            args, f"{args.log}: read by VaneLoop, and by others", ["what", "VaneLoop", "another", "by", "same"],
+            [[c.what, c.ours, c.theirs, c.by, words[c.same]] for c in found],
+        )  # fmt: skip
+    terminal.write_json(args, data)
     if args.out:
         head = f"How VaneLoop reads the logs of this bench (--mapping). From {Path(args.log).name}."
         remarks = {r.signal: f"guessed, {100 * r.confidence:.0f} % sure" for r in seen.rows if r.how == "guessed"}
         write_mapping(args.out, seen.bench(), remarks, head)
         terminal.say(args, f"mapping: {args.out}")
-    return 1 if seen.complaint else 0
+    return 1 if seen.complaint or unlike else 0

@@ -1,0 +1,1 @@
+"""Small logs that other libraries wrote, and what makes them (`make.py`)."""
