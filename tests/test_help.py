@@ -18,7 +18,7 @@ from hil.logs import Channel, read_log, write_log
 from hil.logs.formats import FORMATS
 from tests.conftest import ROOT
 from vaneloop.base import terminal
-from vaneloop.cli.main import COMMANDS, IN_CHECKOUT, main
+from vaneloop.cli.main import COMMANDS, GROUPS, IN_CHECKOUT, main
 
 _KINDS = "|".join(s[1:] for s in (*FORMATS, ".toml", ".dbc", ".html", ".py", ".json"))
 _FILE = re.compile(rf"[\w./-]+\.(?:{_KINDS})|[\w./-]+/")
@@ -54,17 +54,6 @@ def examples(name: str) -> list[list[str]]:
     return out
 
 
-def made() -> set[str]:
-    """Files and folders that the examples of all commands write."""
-    out = set()
-    for name in MODULES:
-        for words in examples(name):
-            out |= {b for a, b in zip(words, words[1:], strict=False) if a in _MAKES}
-            if words[0] in ("record", "new-controller"):
-                out.add(words[1])
-    return out
-
-
 @pytest.mark.parametrize("name", list(MODULES))
 def test_every_example_of_the_help_parses(name: str) -> None:
     for words in examples(name):
@@ -73,19 +62,51 @@ def test_every_example_of_the_help_parses(name: str) -> None:
 
 @pytest.mark.parametrize("name", list(MODULES))
 def test_every_file_that_the_help_names_is_there(name: str) -> None:
-    """It is in the checkout, an example makes it, or it is in capitals: the reader's own."""
-    there = made()
-    folders = tuple(m for m in there if m.endswith("/"))
+    """It is in the checkout, an example above it makes it, or it is in capitals: the reader's own."""
+    there: set[str] = set()
     for words in examples(name):
-        for before, word in zip(words, words[1:], strict=False):
-            if _FILE.fullmatch(word) and before not in _MAKES and word not in there and not word.startswith(folders):
+        makes = {b for a, b in zip(words, words[1:], strict=False) if a in _MAKES}
+        makes |= {words[1]} if words[0] in ("record", "new-controller") else set()
+        made = (*(there | makes), *(f for f in there if f.endswith("/")))
+        for word in words[1:]:
+            if _FILE.fullmatch(word) and not word.startswith(made):
                 assert (ROOT / word).exists() or Path(word).stem.isupper(), f"{' '.join(words)}: {word}"
+        there |= makes
 
 
 def test_a_missing_file_and_a_wrong_option_in_an_example_would_be_seen() -> None:
     with pytest.raises(SystemExit):
         parser_of("replay").parse_args(["examples/engine_run.blf", "--tolerence", "vigv=1"])
     assert not (ROOT / "examples/engine_run.log").exists() and _FILE.fullmatch("examples/engine_run.log")
+
+
+# ---- the help of the whole -------------------------------------------------------------------------------------------
+
+
+def test_the_help_says_what_the_readme_says(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    said = capsys.readouterr().out
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    first, second = readme.split("\n\n")[1:3]
+    assert said.startswith(f"{first}\n\n{second}\n\n")
+    block = re.search(r"## Find what a model lacks\n.*?```\n(.*?)```", readme, re.S)
+    assert block
+    steps = [re.sub(r"\s+#.*", "", line) for line in block[1].splitlines()]
+    shown = re.search(r"^first steps, in a checkout:\n((?:  .*\n)+)", said, re.M)
+    assert shown and len(steps) == 5
+    assert [line.strip() for line in shown[1].splitlines()] == steps
+
+
+def test_the_help_shows_every_command_in_one_of_five_groups(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["--help"])
+    said = capsys.readouterr().out
+    assert len(GROUPS) == 5 and sum(map(len, GROUPS.values())) == len(COMMANDS)
+    for title, group in GROUPS.items():
+        shown = re.search(rf"^{title}:\n((?:  .*\n)+)", said, re.M)
+        assert shown, title
+        rows = [re.split(r"\s{2,}", line.strip(), maxsplit=1) for line in shown[1].splitlines()]
+        assert rows == [[name, text] for name, (_, text) in group.items()]
+    assert max(map(len, said.splitlines())) <= 120
 
 
 # ---- the examples, run -----------------------------------------------------------------------------------------------
@@ -126,8 +147,8 @@ LONG_EXAMPLES = {"inject --all", "schedule --geometry", "engine-test --tables", 
 
 
 def runs(long: bool) -> list[tuple[str, str]]:
-    """Command and example, as it is run: the quick ones, or the long ones."""
-    out = []
+    """Command and example, as it is run: the quick ones, or the long ones. One that several helps have is run once."""
+    out: dict[str, str] = {}
     for name in MODULES:
         for words in examples(name):
             line = shlex.join(words)
@@ -135,8 +156,8 @@ def runs(long: bool) -> list[tuple[str, str]]:
                 continue
             slow = words[0] in LONG or any(line.startswith(k) for k in LONG_EXAMPLES)
             if slow == long:
-                out.append((name, line))
-    return list(dict.fromkeys(out))
+                out.setdefault(line, name)
+    return [(name, line) for line, name in out.items()]
 
 
 @pytest.fixture(scope="module")

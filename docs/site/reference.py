@@ -23,7 +23,7 @@ from hil.logs import Channel, Log, read_log
 from vaneloop.base import terminal
 from vaneloop.base.signals import UNITS
 from vaneloop.base.tables import Bound, load_toml, path
-from vaneloop.cli.main import COMMANDS
+from vaneloop.cli.main import COMMANDS, GROUPS
 from vaneloop.identification.candidates.library import LAWS, Size
 
 __all__ = ["pages"]
@@ -64,10 +64,11 @@ def table(head: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
 
 def index_page() -> str:
     """What the reference holds."""
-    rows = [(f"[`{name}`](commands/{name}.md)", text) for name, (_, text) in COMMANDS.items()]
-    return f"# Reference\n\n{MADE}\n\n## Commands\n\n`vaneloop COMMAND --help` prints the same.\n\n" + table(
-        ("command", "does"), rows
-    )
+    out = ["# Reference", MADE, "## Commands", "`vaneloop COMMAND --help` prints the same."]
+    for title, group in GROUPS.items():
+        rows = [(f"[`{name}`](commands/{name}.md)", text) for name, (_, text) in group.items()]
+        out += [f"### {title[:1].upper()}{title[1:]}", table(("command", "does"), rows)]
+    return "\n\n".join(out)
 
 
 def command_page(name: str) -> str:

@@ -23,6 +23,7 @@ unit and in multiples of the noise floor.
 
 examples:
   vaneloop compare examples/hidden_effect.parquet
+  vaneloop extend examples/hidden_effect.parquet --effect valve_dead_band --out with_dead_band.toml
   vaneloop compare examples/hidden_effect.parquet --model with_dead_band.toml --tolerance vigv=0.2 --report compare.html
 
 exit codes: 0 agrees (or no tolerance given), 1 a tolerance is exceeded, 2 bad input"""

@@ -30,6 +30,7 @@ examples:
   vaneloop engine-test --report engine_test.html
   vaneloop engine-test --strategy inverse --strategy adaptive
   vaneloop engine-test --profile tables/engine_test.toml --seed 7 --json -
+  vaneloop schedule --geometry tables/geometry.toml --out engine7/
   vaneloop engine-test --tables engine7/ --geometry engine7/geometry.toml
 
 exit codes: 0 the dual curves stay at or below the paper's figures, 1 they do not, 2 bad input"""

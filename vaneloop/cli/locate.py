@@ -19,6 +19,7 @@ Significance is corrected for the number of conditions examined.
 
 examples:
   vaneloop locate examples/hidden_effect.parquet --report locate.html
+  vaneloop extend examples/hidden_effect.parquet --effect valve_dead_band --out with_dead_band.toml
   vaneloop locate examples/hidden_effect.parquet --model with_dead_band.toml --json -
 
 exit codes: 0 every subsystem fits everywhere, 1 at least one fails, 2 bad input"""

@@ -43,6 +43,7 @@ docs/strategies.md explains the strategies.
 examples:
   vaneloop strategies --report strategies.html
   vaneloop strategies --play 2.0 --growth 0.3 --json -
+  vaneloop schedule --geometry tables/geometry.toml --out engine7/
   vaneloop strategies --tables engine7/ --seed 7
 
 exit codes: 0 all goals are met, 1 one is missed, 2 bad input"""

@@ -31,6 +31,7 @@ Python models are taken on the command line only.
 examples:
   vaneloop web
   vaneloop web --port 9000 --folder examples --no-open
+  vaneloop schedule --geometry tables/geometry.toml --out engine7/
   vaneloop web --tables engine7/
   vaneloop web --host 0.0.0.0
 
