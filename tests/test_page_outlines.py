@@ -377,16 +377,25 @@ def test_an_extended_model() -> None:
     d = replace(d, stages=[worse])
     page = extended_page(d, bound, "vaneloop extend", "a.csv", "its error on the test log is larger")
     approve("extended_refused", "\n".join(outline(page).splitlines()[:30]) + "\n")
-    assert "falls from 12 to 4.00 noise floors: an error remains." in extended_page(d, bound, "", "a.csv").verdict
+    assert "falls from 12 to 1.04 noise floors: an error remains." in extended_page(d, bound, "", "a.csv").verdict
     assert extended_page(d, bound, "", "a.csv").tone == "bad"
 
 
 def test_the_next_experiment() -> None:
     d, bound = diagnosis()
     d = replace(d, stages=d.stages[2:], notes=[], shapes={})
-    plan = {"text": "Move slowly.\n\nThen fast.", "t": np.arange(20.0), "n_dem": 50.0 + np.arange(20.0) ** 1.2}
+    table = [
+        {"profile": "stairs", "nats": 40.0, "spreads": 9.5, "repeats": 1},
+        {"profile": "slams", "nats": -233.6, "spreads": 0.0, "repeats": 0},
+    ]
+    plan = {
+        "text": "Move slowly.\n\nThen fast.", "t": np.arange(20.0), "n_dem": 50.0 + np.arange(20.0) ** 1.2,
+        "separates": True, "table": table,
+    }  # fmt: skip
     approve("experiment", outline(experiment_page(d, bound, "vaneloop experiment", "a.csv", "Move the vanes.", plan)))
     assert "next experiment" not in outline(experiment_page(d, bound, "", "a.csv", "None is needed.", None))
+    none = experiment_page(d, bound, "", "a.csv", "No profile.", {**plan, "separates": False})
+    assert not none.figures  # what separates nothing is not drawn as the next experiment
 
 
 def test_where_a_stage_fails() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
@@ -17,7 +18,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from hil.figures import SignalError
-from tests.conftest import examples
+from tests.conftest import ROOT, examples
 from tests.page_outline import unpacked
 from vaneloop.identification.regimes import Located, Regime, StageFigures
 from vaneloop.identification.results import Found, StageDiagnosis
@@ -27,12 +28,18 @@ from vaneloop.pages.diagnosis import located_sentence, located_tone, verdict_sen
 from vaneloop.pages.engine_test import _rise_and_fall
 from vaneloop.pages.failures import failure_map, worst_cell
 from vaneloop.pages.figures import Line, Panel, bars, heat, histogram, loop, overlay, ranking, waterfall
-from vaneloop.pages.fleet import _digits
 from vaneloop.pages.page import Page, Plot, _finite, _json, _version
 from vaneloop.pages.replay import _error_lines, _ratio, _replay_verdict
 from vaneloop.pages.run import _middle_curve, axis_title, loops, rotor_speed, signal_name, speed_lines
 from vaneloop.pages.series import break_at_holes, decimate, distribution, packed, thin_path
 from vaneloop.pages.story import (
+    CANNOT,
+    EXPLAINED,
+    FAILS,
+    FITS,
+    MISSING,
+    UNKNOWN,
+    WORDS,
     doubt,
     extended_sentence,
     fall,
@@ -40,6 +47,7 @@ from vaneloop.pages.story import (
     floors,
     jumps,
     stage_tone,
+    together,
     untold,
     verdict_word,
     word,
@@ -47,7 +55,7 @@ from vaneloop.pages.story import (
     worths,
 )  # fmt: skip
 from vaneloop.pages.strategies import _SHOWN
-from vaneloop.pages.style import THEMES, _luminance, _on, capital, cell_role, heat_colour, number, painted
+from vaneloop.pages.style import THEMES, _luminance, _on, capital, cell_role, heat_colour, interval, number, painted
 
 Array = np.ndarray
 
@@ -360,8 +368,29 @@ def test_a_failure_map_shows_nine_conditions_and_cells_of_more_than_twenty_sampl
 
 
 def test_digits_follow_the_width_of_an_interval() -> None:
-    pairs = ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (1.0, 0.1), (1.0, 0.01), (-1.0, 0.009), (1.0, 1e-12))
-    assert [_digits(v, w) for v, w in pairs] == [3, 3, 3, 3, 4, 5, 9]
+    said = {
+        (1.0391, 1.0362, 1.0419): "1.039 1.036 1.042", (0.79964, 0.79861, 0.80071): "0.7996 0.7986 0.8007",
+        (3497.6, 3450.1, 3544.9): "3498 3450 3545", (0.04, 0.01, 9.0): "0.040 0.010 9.000",
+        (0.0, -0.1, 0.1): "0.00 -0.10 0.10",
+        (2.0, 2.0, 2.0): "2 2 2", (-0.02967, -0.106, 0.04662): "-0.030 -0.106 0.047", (0.0, 0.0, 0.0): "0 0 0",
+        (1.23456e-6, 1.2e-6, 1.3e-6): "1.23e-06 1.20e-06 1.30e-06", (4.0e5, 0.0, 8.0e5): "4.0e+05 0 8.0e+05",
+        (1.5, -math.inf, 2.5): "1.5 -inf 2.5", (-0.001, -0.4, 0.4): "-0.0010 -0.4000 0.4000",
+    }  # fmt: skip
+    assert {v: " ".join(map(str, interval(*v))) for v in said} == said
+    assert number(interval(1.0391, 1.0362, 1.0419)[1]) == "1.036" and interval(1.0391, 1.0362, 1.0419)[1] == 1.0362
+
+
+@given(st.floats(-1e9, 1e9), st.floats(1e-12, 1e9), st.floats(0.0, 1.0))
+@settings(max_examples=examples(200))
+def test_what_an_interval_says_stays_within_a_digit_of_its_width(value: float, width: float, share: float) -> None:
+    low = value - share * width
+    high = low + width
+    if not low <= value <= high or high - low < 1e-12 * abs(value):
+        return
+    told = [float(str(x)) for x in interval(value, low, high)]
+    for shown, true in zip(told, (value, low, high), strict=True):
+        assert abs(shown - true) <= 0.51 * max(0.34 * (high - low), 0.0)
+    assert told[0] != told[1] or told[0] != told[2]
 
 
 # ---------------------------------------------------------------- the file
@@ -622,12 +651,29 @@ def test_what_a_stage_says_is_one_word_with_a_tone() -> None:
     ]
     for s, plain, tone, extended, then in cases:
         assert (word(s), stage_tone(s), word(s, True), stage_tone(s, True)) == (plain, tone, extended, then)
-    assert [verdict_word(v) for v in ("none", "missing", "unknown")] == ["fits", "missing", "unknown"]
+    said = {v: verdict_word(v) for v in ("none", "missing", "unknown", "not_observed")}
+    assert said == {
+        "none": "fits", "missing": "missing", "unknown": "unknown", "not_observed": "cannot tell from this log",
+    }  # fmt: skip
+
+
+def test_the_page_on_answers_lists_every_word_of_a_verdict() -> None:
+    text = (ROOT / "docs" / "reading_an_answer.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([a-z ]+) \| [^|]+ \| ([^|]*`[^|]*) \|", text.split("## Verdicts")[1], re.M)
+    assert [word for word, _ in rows] == [FITS, FAILS, MISSING, UNKNOWN, EXPLAINED, CANNOT]
+    said = {json_word: word for word, cell in rows if word != EXPLAINED for json_word in re.findall(r"`(\w+)`", cell)}
+    assert {k: said[k] for k in WORDS} == WORDS
 
 
 def test_the_output_that_fails_most_is_told() -> None:
-    assert fall(stage_said("missing", [0.3, 2.0], [0.2, 1.0])) == (0, "3.00", "2.00")
-    assert fall(stage_said("missing", [0.3, 20.0], [0.2, 1.5])) == (1, "20", "1.50")
+    assert fall(stage_said("missing", [0.3, 2.0], [0.2, 1.0]))[0] == 0
+    s = stage_said("missing", [0.3, 20.0], [0.2, 1.5])
+    s.steps, s.excess = [("nominal", 14.3), ("x", 1.3)], 1.3
+    # the waterfall's first level and its last are what the sentence says
+    assert fall(s) == (1, "14.3", "1.30") == (1, *(floors(v) for _, v in falling(s)[:2]))
+    assert together(s) == "the 2 signals of servo together"
+    s.outputs = ("a",)
+    assert together(s) == "a"
 
 
 def test_what_a_log_cannot_tell_is_said() -> None:
@@ -645,10 +691,11 @@ def test_what_a_log_cannot_tell_is_said() -> None:
 def test_an_extended_model_is_told_in_one_sentence() -> None:
     one = stage_said("missing", [0.3, 2.0], [0.1, 1.0], [found("x"), found("y")])
     two = stage_said("unknown", [0.3, 20.0], [0.1, 15.0])
+    one.steps, two.outputs, two.steps, two.excess = [("nominal", 2.5)], ("b",), [("nominal", 20.0)], 15.0
     d = Diagnosis("missing", [one, two], {}, {}, 1.0)
     assert extended_sentence(d) == (
-        "With x and y the error of a falls from 3.00 to 1.00 noise floors: explained; with the nominal model the error "
-        "of b falls from 20 to 15 noise floors: an error remains."
+        "With x and y the error of the 2 signals of servo together falls from 2.50 to 1.00 noise floors: explained; "
+        "with the nominal model the error of b falls from 20 to 15 noise floors: an error remains."
     )
     assert extended_sentence(Diagnosis("none", [], {}, {}, 1.0)) == "Nothing was extended."
     assert extended_sentence(d, "too large") == "The model is no better with it: too large."
@@ -726,8 +773,9 @@ def test_a_diagnosis_is_told_in_one_sentence() -> None:
     lacks = stage_said("missing", [0.3, 2.0], [0.1, 1.0], [found("dip", ["leak", "lag"]), found("grip")])
     strange = stage_said("unknown", [0.3, 2.0], [0.3, 2.0])
     strange.stage = "engine"
-    shape: Any = SimpleNamespace(text="the error of a oscillates")
-    other: Any = SimpleNamespace(text="not the first")
+    faint: Any = SimpleNamespace(text="explains next to nothing", explained=0.19)
+    shape: Any = SimpleNamespace(text="the error of a oscillates", explained=0.2)
+    other: Any = SimpleNamespace(text="not the first", explained=0.2)
     said = (
         "The servo subsystem lacks dip (or leak, lag) and grip; the engine subsystem lacks something that the library "
         "does not"
@@ -736,7 +784,7 @@ def test_a_diagnosis_is_told_in_one_sentence() -> None:
     d = Diagnosis(
         "unknown",
         [lacks, stage_said("none", [0.1, 1.0], [0.1, 1.0]), strange],
-        {"engine": [shape, other]},
+        {"engine": [faint, shape, other]},
         {"linkage": "no vigv"},
         1.0,
     )

@@ -11,7 +11,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.cli import explain, options, own_model
 from vaneloop.cli.chains import chain_of
 from vaneloop.cli.options import add_machine_options
-from vaneloop.pages.story import CANNOT, doubt, word
+from vaneloop.pages.story import CANNOT, UNKNOWN, doubt, sizes, word
 from vaneloop.verbs.search import diagnosed, not_given
 
 __all__ = ["DESCRIPTION", "add_options", "command", "show"]
@@ -86,14 +86,11 @@ def show(args: argparse.Namespace, answer: Any) -> None:
     options.say_tested(args, answer.tested)
     for s in d.stages:
         for f in s.effects:
-            values = ", ".join(
-                f"{n} {p['value']:.4g} [{p['low']:.4g}, {p['high']:.4g}] {p['unit']}" for n, p in f.parameters.items()
-            )
             unsure = f"; {doubt(f)}" if doubt(f) else ""
-            terminal.say(args, f"missing in {s.stage}: {f.effect} ({100 * f.probability:.0f} %): {values}{unsure}")
+            terminal.say(args, f"missing in {s.stage}: {f.effect} ({100 * f.probability:.0f} %): {sizes(f)}{unsure}")
         for x in d.shapes.get(s.stage, []):
-            terminal.say(args, f"{'unknown' if s.verdict == 'unknown' else 'left'} in {s.stage}: {x.text}")
+            terminal.say(args, f"{UNKNOWN if s.verdict == 'unknown' else 'left'} in {s.stage}: {x.text}")
         if s.verdict == "unknown" and (s.nearest or s.refused):
             nearest = ", ".join(s.nearest) or "none"
-            terminal.say(args, f"unknown in {s.stage}, nearest: {nearest}{''.join(f'; {why}' for why in s.refused)}")
+            terminal.say(args, f"{UNKNOWN} in {s.stage}, nearest: {nearest}{''.join(f'; {why}' for why in s.refused)}")
     terminal.say(args, answer.sentence())

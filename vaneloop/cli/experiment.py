@@ -11,6 +11,7 @@ from vaneloop.base import terminal
 from vaneloop.cli import options
 from vaneloop.cli.chains import chain_of
 from vaneloop.cli.options import add_machine_options
+from vaneloop.identification.settings import MOST_REPEATS
 from vaneloop.verbs.search import diagnosed
 from vaneloop.verbs.search import experiment as recommend
 
@@ -30,7 +31,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     options.add_log_options(parser)
     add_machine_options(parser)
-    parser.add_argument("--out", metavar="F.csv", help="write the demand profile as a log (t, n_dem)")
+    parser.add_argument(
+        "--out", metavar="F.csv", help="write the demand profile as a log (t, n_dem), if it separates the rivals"
+    )
     terminal.add_output_options(parser, report=True)
 
 
@@ -45,18 +48,24 @@ def command(args: argparse.Namespace) -> int:
     if e is None:
         terminal.say(args, "nothing to separate: the log leaves no rivals")
     else:
-        rows = [[r["profile"], f"{r['nats']:.1f}", r["repeats"] or "-"] for r in e["table"]]
+        rows = [
+            [r["profile"], f"{r['nats']:.1f}", f"{r['spreads']:.1f}", str(r["repeats"] or f"over {MOST_REPEATS}")]
+            for r in e["table"]
+        ]
         terminal.print_table(
             args,
             "divergence of the closest pair of rivals after refit",
-            ["profile", "log-likelihood ratio a run", "runs needed"],
+            ["profile", "log-likelihood ratio a run", "standard deviations", "runs needed"],
             rows,
         )
         terminal.say(args, answer.sentence())
     terminal.write_json(args, answer.to_dict())
     if e is not None and args.out:
-        write_log(Path(args.out), {"n_dem": Channel(e["t"], e["n_dem"])})
-        terminal.say(args, f"profile: {args.out}")
+        if e["separates"]:
+            write_log(Path(args.out), {"n_dem": Channel(e["t"], e["n_dem"])})
+            terminal.say(args, f"profile: {args.out}")
+        else:
+            print(f"vaneloop experiment: no profile separates the rivals; {args.out} is not written", file=sys.stderr)
     if args.report:
         words = " ".join(["vaneloop experiment", *sys.argv[2:]])
         terminal.say(args, f"page: {answer.report(args.report, words)}")

@@ -12,7 +12,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.files import check
 from vaneloop.cli import options, own_model
 from vaneloop.cli.chains import chain_of
-from vaneloop.pages.story import falling, floors, word
+from vaneloop.pages.story import falling, floors, sizes, word
 from vaneloop.verbs.machine import with_law_files
 from vaneloop.verbs.search import extended, known
 
@@ -82,10 +82,7 @@ def command(args: argparse.Namespace) -> int:
     options.say_tested(args, answer.tested)
     for r in results:
         for f in r.effects:
-            values = ", ".join(
-                f"{n} {p['value']:.4g} [{p['low']:.4g}, {p['high']:.4g}] {p['unit']}" for n, p in f.parameters.items()
-            )
-            terminal.say(args, f"{f.effect}: {values}")
+            terminal.say(args, f"{f.effect}: {sizes(f)}")
         terminal.say(
             args, f"{r.stage}, in noise floors: " + " -> ".join(f"{name} {floors(level)}" for name, level in falling(r))
         )

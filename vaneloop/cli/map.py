@@ -50,7 +50,7 @@ def command(args: argparse.Namespace) -> int:
         for r in seen.rows
     ]  # fmt: skip
     terminal.print_table(
-        args, f"{args.log}: {len(rows)} names are known, {len(seen.other)} are not",
+        args, f"{args.log}: names known: {len(rows)}, not known: {len(seen.other)}",
         ["signal", "in the log", "unit", "sure", "range", "over time"], rows,
     )  # fmt: skip
     for signal, why in seen.open.items():

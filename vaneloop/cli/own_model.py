@@ -14,6 +14,7 @@ from vaneloop.cli import options
 from vaneloop.identification import StageError, load_system
 from vaneloop.identification.user_models.by_log import load_model_of
 from vaneloop.pages.by_log import heads, short_names
+from vaneloop.pages.story import sized
 from vaneloop.verbs import learn, search
 from vaneloop.verbs.parts import split
 from vaneloop.verbs.search import read_record
@@ -113,5 +114,4 @@ def show(args: argparse.Namespace, by_log: Any) -> None:
     columns = ["log", "", "signal", *heads(by_log), "of RMS", "unit"]
     terminal.print_table(args, "RMS error log by log", columns, rows)
     for p in by_log.parameters() if d.steps[1:] else ():
-        value, low, high = (float(str(p[key])) for key in ("value", "low", "high"))
-        terminal.say(args, f"parameter {p['parameter']}: {value:.5g} [{low:.5g}, {high:.5g}] {p['unit']}")
+        terminal.say(args, f"parameter {sized(str(p['parameter']) + ':', p)}")

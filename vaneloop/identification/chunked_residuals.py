@@ -160,6 +160,7 @@ def of_whole(d: StageDiagnosis, sums: Sums, fails: Sequence[Failing]) -> StageDi
         error_before=floors[0] * sums.floor,
         error_after=floors[1] * sums.floor,
         floor=sums.floor,
+        steps=[("nominal", float(before)), *([(" + ".join(d.final.effects), float(after))] if d.final.effects else [])],
         excess=float(after),
     )
     if d.verdict == "unknown" or d.criterion != "noise_floor":

@@ -16,7 +16,7 @@ from vaneloop.base.compiled import compiled
 from vaneloop.identification.least_squares.noise import colour_of, tolerance
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
 from vaneloop.identification.results import rms_per_output
-from vaneloop.identification.settings import AGREES, COLOUR, NOISE_KNOWN_TO, REGIME_BINS, REGIME_LEVEL
+from vaneloop.identification.settings import AGREES, CORRELATION, NOISE_KNOWN_TO, REGIME_BINS, REGIME_LEVEL, SHAPE_TOLD
 from vaneloop.identification.subsystem import Array, without_jumps
 
 __all__ = [
@@ -440,7 +440,7 @@ def shape(judge: LeastSquaresProblem, fit: Fit, noise: float = 1.0) -> list[Shap
         if best is None:
             continue
         explained, name, x, curve, x_unit = best
-        if explained < 0.02:
+        if explained < SHAPE_TOLD:
             text = f"{what}: {np.sqrt(total):.3g} {unit} rms, not a function of any one logged condition"
         else:
             text = f"{what} {_in_words(name, x, curve, unit, x_unit)}; explains {100 * explained:.0f} % of what is left"

@@ -526,6 +526,12 @@ REGIME_LEVEL = setting(
     "Any bin of any condition is called significant by this chance when nothing is missing.",
     "principle: test at 1 %, divided by the number of bins (Bonferroni)",
 )
+SHAPE_TOLD = setting(
+    0.2,
+    "share",
+    "What is left is described as a function of a condition where that explains at least this share of it.",
+    "judgement: a curve that leaves four fifths unexplained describes something else",
+)
 
 # ---- Unmodelled terms -----------------------------------------------------------------------------------------------
 under("Unmodelled terms")

@@ -15,7 +15,7 @@ from vaneloop.base.side_by_side import forks, in_processes
 from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
 from vaneloop.identification.regimes import Located, Shape, StageFigures, agrees, locate, shape
-from vaneloop.identification.results import StageDiagnosis, parameters_of, recalibrated, rms_per_output, weigh
+from vaneloop.identification.results import StageDiagnosis, parameters_of, recalibrated, rms_of, rms_per_output, weigh
 from vaneloop.identification.selection.diagnosis import Judged, diagnose_stage, extend_stage, floor_of
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, as_close, significant
 from vaneloop.identification.selection.rules import decisions_json
@@ -250,7 +250,8 @@ def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
             name, fit = left[0], d.final
             if name != f.effect:
                 fit = refitted.get(name) or _with(judge, {**beside, name: f.fits[name]})
-                d.final, d.error_after = fit, rms_per_output(judge, fit)
+                d.final, d.error_after, d.excess = fit, rms_per_output(judge, fit), rms_of(judge, fit)
+                d.steps = [*d.steps[:-1], (" + ".join(fit.effects), d.excess)]
                 d.recalibrated = recalibrated(stages[d.stage], fit)
                 for other in d.effects:
                     if other is not f:

@@ -12,6 +12,7 @@ from vaneloop.identification.settings import NO_HELP
 from vaneloop.identification.user_models.by_log import ByLog
 from vaneloop.pages.figures import UNDER, Line, Panel, bars, loop, overlay
 from vaneloop.pages.page import Page
+from vaneloop.pages.style import interval
 
 __all__ = ["curves_by_log", "heads", "log_by_log", "short_names"]
 
@@ -67,7 +68,7 @@ def log_by_log(page: Page, by_log: ByLog) -> None:
         page.section("Parameters of the model")
         page.table(
             ["parameter", "value", "low", "high", "unit"],
-            [[p["parameter"], p["value"], p["low"], p["high"], p["unit"]] for p in by_log.parameters()],
+            [[p["parameter"], *interval(p["value"], p["low"], p["high"]), p["unit"]] for p in by_log.parameters()],
         )
 
 

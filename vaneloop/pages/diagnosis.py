@@ -12,6 +12,7 @@ from vaneloop.base.signals import heading
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.regimes import Located, locate
 from vaneloop.identification.results import StageDiagnosis
+from vaneloop.identification.settings import MOST_REPEATS, SHAPE_TOLD
 from vaneloop.identification.subsystem import Bound, Stage
 from vaneloop.identification.user_models.by_log import ByLog
 from vaneloop.identification.workflow import Diagnosis
@@ -37,7 +38,7 @@ from vaneloop.pages.story import (
     word_of_located,
     worths,
 )
-from vaneloop.pages.style import TONE_OF, Tone, capital, number
+from vaneloop.pages.style import TONE_OF, Tone, capital, interval, number
 
 __all__ = [
     "compare_page", "diagnosis_page", "experiment_page", "extended_page", "located_sentence", "located_tone",
@@ -57,7 +58,7 @@ def verdict_sentence(d: Diagnosis, by_log: ByLog | None = None) -> str:
             names = [f"{f.effect}" + (f" (or {', '.join(f.rivals)})" if f.rivals else "") for f in s.effects]
             parts.append(f"the {s.stage} subsystem lacks {' and '.join(names)}")
         elif s.verdict == "unknown":
-            first = d.shapes.get(s.stage, [])
+            first = [x for x in d.shapes.get(s.stage, []) if x.explained >= SHAPE_TOLD]
             what = f": {first[0].text}" if first else ""
             parts.append(f"the {s.stage} subsystem lacks something that the library does not have{what}")
     if not parts:
@@ -224,14 +225,21 @@ def _told(
     for s in d.stages:
         k, before, after = fall(s)
         moved = s.verdict != "none"
-        note = f"{number(s.error_before[k])}{f' to {number(s.error_after[k])}' if moved else ''} {s.units[k]}"
+        note = f"{s.outputs[k]} " if len(s.outputs) > 1 else ""
+        note += f"{number(s.error_before[k])}{f' to {number(s.error_after[k])}' if moved else ''} {s.units[k]}"
         note += f"; noise floor {number(s.floor[k])}"
         value = f"{before} → {after}" if moved else before
         said = word(s, extended)
         if said in (MISSING, EXPLAINED) and s.effects:
             names = ", ".join(f.effect for f in s.effects)
             said = f"{said}, with {names} added" if extended and said == MISSING else f"{said}: {names}"
-        page.tile(f"{s.stage}: {s.outputs[k]}", value, "noise floors", f"{said}; {note}", stage_tone(s, extended))
+        page.tile(
+            f"{s.stage}: {f'its {len(s.outputs)} signals together' if len(s.outputs) > 1 else s.outputs[0]}",
+            value,
+            "noise floors",
+            f"{said}; {note}",
+            stage_tone(s, extended),
+        )
     if experiment:
         _next(page, experiment)
     page.section(
@@ -259,7 +267,7 @@ def _told(
         rows = []
         for s, f in found:
             for name, p in f.parameters.items():
-                row = [name, p["value"], p["low"], p["high"], p["unit"]]
+                row = [name, *interval(p["value"], p["low"], p["high"]), p["unit"]]
                 sure = [] if extended else [f"{100 * f.probability:.0f} %"]
                 rows.append([f.effect, s.stage, *sure, *row, *([] if extended else [doubt(f) or "none"])])
         columns = ["parameter", "value", "low", "high", "unit"]
@@ -294,7 +302,7 @@ def _told(
         page.section("Recalibrated", "Nominal parameters that moved within their tolerance: not a missing effect.")
         page.table(
             ["parameter", "value", "low", "high", "unit"],
-            [[r["parameter"], r["value"], r["low"], r["high"], r["unit"]] for r in recal],
+            [[r["parameter"], *interval(r["value"], r["low"], r["high"]), r["unit"]] for r in recal],
         )
     unseen = [[c.effect, s.stage, c.reason] for s in d.stages for c in s.candidates if c.reason]
     if unseen:
@@ -310,8 +318,17 @@ def _told(
 
 def _next(page: Page, experiment: dict[str, Any]) -> None:
     page.section("The next experiment", str(experiment["text"]))
-    page.plot(
-        overlay([Panel("rotor speed demand [%]", [Line("n_dem", experiment["t"], experiment["n_dem"], "target")])])
+    if experiment["separates"]:
+        page.plot(
+            overlay([Panel("rotor speed demand [%]", [Line("n_dem", experiment["t"], experiment["n_dem"], "target")])])
+        )
+    page.table(
+        ["profile", "log-likelihood ratio a run", "standard deviations", "runs needed"],
+        [
+            [r["profile"], r["nats"], r["spreads"], str(r["repeats"] or f"over {MOST_REPEATS}")]
+            for r in experiment["table"]
+        ],
+        digits=4,
     )
 
 

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 from vaneloop.pages.figures import Figure, Line, Panel, heat, overlay
 from vaneloop.pages.page import Link, Page
 from vaneloop.pages.story import verdict_word
+from vaneloop.pages.style import interval
 
 __all__ = ["FleetView", "Series", "fleet_page", "log_page"]
 
@@ -208,8 +209,8 @@ def _trends(page: Page, view: FleetView, logs: str) -> None:
         when = day(x["limit_time"]) if x["limit_time"] else "–"
         if x["limit_time"]:
             when += f" ({day(x['limit_low'])} to {day(x['limit_high']) if x['limit_high'] else 'no latest time'})"
-        n = _digits(x["rate"], x["rate_high"] - x["rate_low"])
-        numbers = f"{x['rate']:.{n}g} ({x['rate_low']:.{n}g} to {x['rate_high']:.{n}g})"
+        rate, low, high = interval(x["rate"], x["rate_low"], x["rate_high"])
+        numbers = f"{rate} ({low} to {high})"
         change = f"{numbers} {s.unit}{'' if step else '/year'}"
         rows.append([
             s.engine, s.quantity, x["kind"], f"{day(x['onset'])} ({day(x['onset_low'])} to {day(x['onset_high'])})",
@@ -222,11 +223,6 @@ def _trends(page: Page, view: FleetView, logs: str) -> None:
         page.text("None.")
     for s in view.changed[:SHOWN]:
         page.plot(_drawn(s), f"{s.engine}: {s.quantity}", half=True)
-
-
-def _digits(value: float, width: float) -> int:
-    """Digits that a value with an interval of this width is worth: two of the interval, three at least."""
-    return 3 if width <= 0.0 or value == 0.0 else int(np.clip(np.ceil(np.log10(abs(value) / width)) + 2, 3, 9))
 
 
 def _drawn(s: Series) -> Figure:
@@ -325,22 +321,25 @@ def log_page(key: str, answer: dict[str, Any]) -> Page:
         f"Log {key[:8]}", f"Verdict: {verdict_word(answer['verdict'])}.", tone=tones.get(answer["verdict"], "neutral"),  # type: ignore[arg-type]
         subtitle="fleet", log=answer["log"], command=f"vaneloop diagnose {answer['log']} --report diagnosis.html",
     )  # fmt: skip
-    columns = ["stage", "verdict", "signal", "error before", "error after", "noise floor", "unit"]
+    columns = ["subsystem", "verdict", "signal", "error before", "error after", "noise floor", "unit"]
     fields = ("stage", "verdict", "signal", "error_before", "error_after", "noise_floor", "unit")
     if rows := [{**s, "verdict": verdict_word(s["verdict"])} for s in answer["stages"]]:
-        page.section("Stages", "RMS errors on held-out data. The command below gives the page with all curves.")
+        page.section("Subsystems", "RMS errors on held-out data. The command below gives the page with all curves.")
         page.table(columns, [[s.get(k) for k in fields] for s in rows])
     if answer["effects"]:
         page.section("Effects")
         page.table(
             ["effect", "subsystem", "probability", "parameter", "value", "low", "high", "unit", "as good"],
-            [[e["effect"], e["stage"], e["probability"], n, p["value"], p["low"], p["high"], p["unit"],
+            [[e["effect"], e["stage"], e["probability"], n, *interval(p["value"], p["low"], p["high"]), p["unit"],
               ", ".join(e["rivals"]) or "–"] for e in answer["effects"] for n, p in e["parameters"].items()],
         )  # fmt: skip
     if answer.get("nominal"):
         page.section("Nominal parameters")
-        names = ("stage", "parameter", "value", "low", "high", "table", "tolerance", "unit")
-        page.table(names, [[p[k] for k in names] for p in answer["nominal"]])
+        page.table(
+            ["subsystem", "parameter", "value", "low", "high", "table", "tolerance", "unit"],
+            [[p["stage"], p["parameter"], *interval(p["value"], p["low"], p["high"]), p["table"], p["tolerance"],
+              p["unit"]] for p in answer["nominal"]],
+        )  # fmt: skip
     for note in answer.get("notes", []):
         page.text(note)
     return page

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,19 +11,25 @@ import numpy as np
 from vaneloop.identification.regimes import Located, agrees
 from vaneloop.identification.results import Found, StageDiagnosis
 from vaneloop.identification.workflow import Diagnosis
-from vaneloop.pages.style import Tone, capital
+from vaneloop.pages.style import Tone, capital, interval
 
 __all__ = [
-    "CANNOT", "EXPLAINED", "FITS", "MISSING", "UNKNOWN", "Worth", "doubt", "extended_sentence", "fall",
-    "falling", "floors",
-    "jumps", "reached", "stage_tone", "untold", "verdict_word", "word", "word_of_located", "worths",
+    "CANNOT", "EXPLAINED", "FAILS", "FITS", "MISSING", "UNKNOWN", "WORDS", "Worth", "doubt", "extended_sentence",
+    "fall", "falling", "floors", "jumps", "reached", "sized", "sizes", "stage_tone", "together", "untold",
+    "verdict_word", "word", "word_of_located", "worths",
 ]  # fmt: skip
 
+# The words of all verdicts (docs/reading_an_answer.md has them as a table).
 FITS = "fits"  # no error beyond the noise
-EXPLAINED = "explained"  # effects were added, and no error beyond the noise is left
+FAILS = "fails"  # an error beyond the noise, of which nobody has asked what it is yet
 MISSING = "missing"  # an effect of the library would explain the error
 UNKNOWN = "unknown"  # the error is there, and nothing in the library explains it
+EXPLAINED = "explained"  # effects were added, and no error beyond the noise is left
 CANNOT = "cannot tell from this log"
+# a subsystem's verdict as the JSON has it -> as a reader is told it
+WORDS = {
+    "none": FITS, "agrees": FITS, "fails": FAILS, "missing": MISSING, "unknown": UNKNOWN, "not_observed": CANNOT,
+}  # fmt: skip
 
 
 def floors(ratio: float) -> str:
@@ -49,7 +55,7 @@ def reached(s: StageDiagnosis) -> bool:
 
 def verdict_word(verdict: str) -> str:
     """A verdict as the JSON has it, as a reader is told it."""
-    return FITS if verdict == "none" else verdict
+    return WORDS.get(verdict, verdict)
 
 
 def word(s: StageDiagnosis, extended: bool = False) -> str:
@@ -63,7 +69,7 @@ def word(s: StageDiagnosis, extended: bool = False) -> str:
 
 def word_of_located(located: Located) -> str:
     """Whether a stage with nothing added fits or fails."""
-    return "fails" if located.fails else FITS
+    return FAILS if located.fails else FITS
 
 
 def stage_tone(s: StageDiagnosis, extended: bool = False) -> Tone:
@@ -72,9 +78,27 @@ def stage_tone(s: StageDiagnosis, extended: bool = False) -> Tone:
 
 
 def fall(s: StageDiagnosis) -> tuple[int, str, str]:
-    """The output that fails most, and its error in noise floors before and after."""
+    """The output that fails most, and the stage's error in noise floors before and after, of all outputs together: the
+    steps of `falling` begin and end there.
+    """
     k = int(np.argmax(s.error_before / s.floor))
-    return k, floors(float(s.error_before[k] / s.floor[k])), floors(float(s.error_after[k] / s.floor[k]))
+    return k, floors(s.steps[0][1] if s.steps else s.excess), floors(s.excess)
+
+
+def together(s: StageDiagnosis) -> str:
+    """Whose error `fall` tells: the stage's only output, or all of them."""
+    return s.outputs[0] if len(s.outputs) == 1 else f"the {len(s.outputs)} signals of {s.stage} together"
+
+
+def sized(name: str, p: Mapping[str, object]) -> str:
+    """A parameter of an effect with its interval and unit."""
+    value, low, high = interval(p["value"], p["low"], p["high"])
+    return f"{name} {value} [{low}, {high}] {p['unit']}"
+
+
+def sizes(f: Found) -> str:
+    """All parameters of an effect."""
+    return ", ".join(sized(name, p) for name, p in f.parameters.items())
 
 
 def doubt(f: Found) -> str:
@@ -93,10 +117,10 @@ def extended_sentence(d: Diagnosis, refused: str = "") -> str:
         return f"The model is no better with it: {refused}."
     parts = []
     for s in d.stages:
-        k, before, after = fall(s)
+        _, before, after = fall(s)
         names = " and ".join(f.effect for f in s.effects) or "the nominal model"
         end = EXPLAINED if reached(s) else "an error remains"
-        parts.append(f"with {names} the error of {s.outputs[k]} falls from {before} to {after} noise floors: {end}")
+        parts.append(f"with {names} the error of {together(s)} falls from {before} to {after} noise floors: {end}")
     text = "; ".join(parts) or "nothing was extended"
     return f"{capital(text)}."
 

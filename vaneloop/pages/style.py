@@ -10,7 +10,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-__all__ = ["STAGE_ROLES", "THEMES", "TONE_OF", "Tone", "capital", "cell_role", "heat_colour", "number", "painted"]
+__all__ = [
+    "STAGE_ROLES", "THEMES", "TONE_OF", "Rounded", "Tone", "capital", "cell_role", "heat_colour", "interval", "number",
+    "painted",
+]  # fmt: skip
 
 Tone = Literal["neutral", "good", "bad"]
 # colours of the vane stages side by side, VIGV first
@@ -100,6 +103,8 @@ def number(value: object, digits: int = 3) -> str:
         return "–"
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
+    if isinstance(value, Rounded):
+        return value.text
     if isinstance(value, int | np.integer):
         return f"{int(value):,}"
     if isinstance(value, float | np.floating):
@@ -116,6 +121,54 @@ def number(value: object, digits: int = 3) -> str:
             decimals -= 1
         return f"{v:,.{decimals}f}"
     return str(value)
+
+
+class Rounded(float):
+    """A number with the digits that its interval is worth (`interval`)."""
+
+    text: str
+
+    def __new__(cls, value: float, text: str) -> Rounded:
+        out = super().__new__(cls, value)
+        out.text = text
+        return out
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def interval(value: object, low: object, high: object) -> tuple[Rounded, Rounded, Rounded]:
+    """A value and the ends of its interval for a reader: all three end at the digit that the interval's width is worth.
+
+    Of the width one digit is shown, two where it begins with 1 or 2; of the value two at least. Without an interval
+    they are shown to four digits.
+    """
+    three = [float(str(v)) for v in (value, low, high)]
+    width, sizes = three[2] - three[1], [abs(v) for v in three if math.isfinite(v)]
+    if not sizes or max(sizes) == 0.0 or not 0.0 < width < math.inf:
+        texts = [f"{v:.4g}" for v in three]
+    else:
+        lead = math.floor(math.log10(width))
+        place = lead - (width / 10.0**lead < 3.0)  # decimal place of the last digit, 10^place
+        if three[0] != 0.0 and math.isfinite(three[0]):
+            place = min(place, math.floor(math.log10(abs(three[0]))) - 1)
+        fixed = 1e-3 <= max(sizes) < 1e5
+        texts = [_to_place(v, place) if fixed else _to_place_of_ten(v, place) for v in three]
+    first, second, third = (Rounded(v, t) for v, t in zip(three, texts, strict=True))
+    return first, second, third
+
+
+def _to_place(value: float, place: int) -> str:
+    """A number to the digit 10^place, or to the unit; zero without a sign."""
+    text = f"{value:.{max(0, -place)}f}"
+    return text if math.isinf(value) or float(text) else text.removeprefix("-")
+
+
+def _to_place_of_ten(value: float, place: int) -> str:
+    """The same with an exponent."""
+    if not math.isfinite(value) or abs(value) < 10.0**place:
+        return f"{value:g}" if math.isinf(value) else "0"
+    return f"{value:.{math.floor(math.log10(abs(value))) - place}e}"
 
 
 def capital(text: str) -> str:

@@ -15,7 +15,20 @@ from vaneloop.pages.failures import failure_map, worst_cell
 from vaneloop.pages.figures import Line as PageLine
 from vaneloop.pages.figures import Panel as PagePanel
 from vaneloop.pages.figures import overlay, waterfall
-from vaneloop.pages.story import CANNOT, doubt, fall, falling, floors, jumps, reached, worths
+from vaneloop.pages.story import (
+    CANNOT,
+    EXPLAINED,
+    FITS,
+    doubt,
+    fall,
+    falling,
+    floors,
+    jumps,
+    reached,
+    sizes,
+    together,
+    worths,
+)
 from vaneloop.pages.style import capital, number
 from vaneloop.web.charts import Chart
 from vaneloop.web.chosen_log import ChosenLog
@@ -322,11 +335,7 @@ class _Page:
         summary = capital(EFFECTS[name].summary) if name in EFFECTS else ""
         if name in found:
             f = found[name]
-            parts = [
-                f"{n} {number(p['value'], 4)} [{number(p['low'], 4)}, {number(p['high'], 4)}] {p['unit']}"
-                for n, p in f.parameters.items()
-            ]
-            text = f"{100 * f.probability:.0f} %: " + "; ".join(parts)
+            text = f"{100 * f.probability:.0f} %: {sizes(f)}"
             return ". ".join(part for part in (text, capital(doubt(f)), summary) if part)
         if name in named:
             return f"Rival of {named[name]}: this log cannot distinguish them. {summary}"
@@ -344,14 +353,15 @@ class _Page:
         k, before, after = fall(r)
         good = reached(r)
         names = " and ".join(x.effect for x in r.effects) or "nothing added"
-        end = "An error remains." if not good else "Explained." if r.effects else "It fits."
+        end = "An error remains." if not good else capital(f"{EXPLAINED if r.effects else FITS}.")
+        whose = f"{capital(together(r))}. " if len(r.outputs) > 1 else ""
         with ui.element("div").classes(f"verdict fell {'good' if good else 'bad'}"):
             ui.label(f"{before} → {after} noise floors").classes("v after").props(
                 f'data-ratio="{r.error_after[k] / r.floor[k]:.4f}"'
             )
             ui.label(
-                f"{r.outputs[k]} with {names}: {number(r.error_before[k])} → {number(r.error_after[k])} {r.units[k]}, "
-                f"noise floor {number(r.floor[k])}, held out. {end}"
+                f"{whose}{r.outputs[k]} with {names}: {number(r.error_before[k])} → {number(r.error_after[k])} "
+                f"{r.units[k]}, noise floor {number(r.floor[k])}, held out. {end}"
             ).classes("l")
         figure_of(waterfall(falling(r), "held-out error [noise floors]", floor=1.0, told=floors), dark(s), height=300)
 
@@ -468,8 +478,9 @@ class _Page:
         e = s.experiment
         if e is not None:
             ui.label(e["text"])
-            lines = [PageLine("n_dem", e["t"], e["n_dem"], "target")]
-            figure_of(overlay([PagePanel("n_dem [%]", lines)]), dark(s), height=230)
+            if e["separates"]:
+                lines = [PageLine("n_dem", e["t"], e["n_dem"], "target")]
+                figure_of(overlay([PagePanel("n_dem [%]", lines)]), dark(s), height=230)
         command_line(s.command("experiment", "--out", "next_demand.csv"))
 
     def _saved(self) -> None:

@@ -180,7 +180,7 @@ def diagnose(progress: Progress, words: list[str]) -> dict[str, Any]:
 
     def news(n: Any) -> None:
         if n.found is not None:
-            k, before, after = fall(n.found)
+            _, before, after = fall(n.found)
             names = " and ".join(f.effect for f in n.found.effects)
             said = f"{n.found.stage} {word(n.found)}" + (f" {names}, {before} → {after} noise floors" if names else "")
             progress(None, {"found": said})

@@ -163,8 +163,10 @@ def recommend(d: Any, progress: Any = None, chain: Any = None) -> dict[str, Any]
         needed = max(MARGIN * NATS / max(nats, 1e-9), (MARGIN * RIVAL_SPREADS / max(spreads, 1e-9)) ** 2)
         by_pair = [[f.effect, r, n] for (_, f, r), (n, _) in zip(pairs, found, strict=True)]
         runs = int(np.ceil(needed)) if needed <= MOST_REPEATS else 0
-        table.append({"profile": name, "nats": nats, "repeats": runs, "needed": needed, "by_pair": by_pair})
-    table.sort(key=lambda r: r["needed"])
+        row = {"profile": name, "nats": nats, "spreads": spreads, "repeats": runs, "needed": needed, "by_pair": by_pair}
+        table.append(row)
+    # the fewest runs first; of profiles that no number of runs helps, the one that comes nearest
+    table.sort(key=lambda r: (r["needed"], -r["nats"]))
     best = table[0]
     once = bank[best["profile"]]
     repeats = max(1, best["repeats"])
@@ -175,12 +177,13 @@ def recommend(d: Any, progress: Any = None, chain: Any = None) -> dict[str, Any]
     gained = repeats * best["nats"]
     text = (
         f"To distinguish {names}: {best['profile']}{often}, {len(profile) / 100:.0f} s; expected log-likelihood ratio "
-        f"{gained:.0f} for the closest pair."
+        f"{gained:.1f} for the closest pair."
     )
     if not separated:
         text = (
-            f"No profile of the bank separates {names}, even {MOST_REPEATS} times over: the "
-            f"log-likelihood ratio is {best['nats']:.1f} a run at best, {MARGIN * NATS:g} is required."
+            f"No profile of the bank separates {names}, even {MOST_REPEATS} times over. The best, {best['profile']}, "
+            f"has a log-likelihood ratio of {best['nats']:.1f} a run, {best['spreads']:.1f} standard deviations; "
+            f"{MARGIN * NATS:g} and {MARGIN * RIVAL_SPREADS:g} are required."
         )
     return {
         "text": text, "profile": best["profile"], "score": gained, "separates": separated, "repeats": repeats,
