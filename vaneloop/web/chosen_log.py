@@ -18,6 +18,8 @@ from vaneloop.web.session import OTHER_SUFFIXES, STOPPED, LogFile, Session, safe
 
 __all__ = ["ChosenLog", "receive", "suffixes"]
 
+EXAMPLE = "hidden_effect.parquet"
+
 
 def suffixes() -> str:
     """What an upload accepts."""
@@ -158,10 +160,13 @@ class ChosenLog:
     def _channels(self) -> None:
         s = self.s
         if s.choice.file is None:
-            ui.label(
-                "Nothing chosen yet. The example hidden_effect.parquet is a machine with two effects that the model "
-                "lacks."
-            ).classes("soft")
+            example = next((f for f in s.files if f.path.name == EXAMPLE), None)
+            more = " The example is a log of a machine with two effects that the model lacks." if example else ""
+            ui.label(f"Nothing chosen yet.{more}").classes("soft")
+            if example is not None:
+                ui.button("Open the example", icon="folder_open", on_click=lambda: s.choose(example)).props(
+                    "unelevated dense padding='4px 14px'"
+                ).classes("open-example self-start")
             if beside := s.choice.beside():
                 ui.label(f"For the log to come: {' and '.join(beside)}.").classes("soft for-the-next").props(
                     'role="status"'
@@ -271,6 +276,15 @@ class ChosenLog:
                 hint = f"{seen['suggested_rpm']:g}?" if seen["suggested_rpm"] else ""
                 rpm = field("rpm", choice.design_rpm, hint, "design speed [rpm]").style("width:170px")
                 rpm.props('label="design speed [rpm]"')
+                if (suggested := seen["suggested_rpm"]) and not choice.design_rpm:
+
+                    def take() -> None:
+                        draft["rpm"] = f"{suggested:g}"
+                        apply()
+
+                    ui.button(f"Use {suggested:g} rpm", on_click=take).props(
+                        "outline dense padding='4px 14px'"
+                    ).classes("use-rpm")
                 beside = choice.beside()
                 ui.label(
                     "with " + " and ".join(beside)

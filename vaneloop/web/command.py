@@ -78,6 +78,8 @@ def command(args: argparse.Namespace) -> int:
             f"characters"
         )
     needs("the workbench", "nicegui", "tsdownsample")
+    if not args.quiet:
+        print("starting the workbench; its link follows ...", file=sys.stderr, flush=True)
     sock = _listen(args.host, args.port)
     host, port = sock.getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host

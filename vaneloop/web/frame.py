@@ -73,11 +73,34 @@ FOCUS = """<script>(() => {
 })();</script>"""
 
 
+# NiceGUI's bar says "Trying to reconnect" for as long as it takes. It says more where nothing answers any more, or
+# where another workbench answers, which does not know this page's token.
+GONE = """<script>(() => {
+  const ended = "The workbench has ended. Start it again (vaneloop web) and open the link that it prints.";
+  const other = "Another workbench runs here now. Open the link that it printed.";
+  addEventListener("DOMContentLoaded", () => {
+    const bar = document.getElementById("popup"), said = bar?.lastElementChild, waiting = said?.textContent;
+    let asking = 0;
+    if (!said) return;
+    bar.setAttribute("role", "alert");
+    const ask = async () => {
+      const answer = await fetch("/assets/uPlot.css", { cache: "no-store" }).catch(() => null);
+      if (asking) said.textContent = !answer ? ended : answer.status === 403 ? other : waiting;
+    };
+    new MutationObserver(() => {
+      const lost = bar.ariaHidden === "false";
+      if (lost && !asking) asking = setInterval(ask, 2000);
+      else if (!lost && asking) { clearInterval(asking); asking = 0; said.textContent = waiting; }
+    }).observe(bar, { attributes: true, attributeFilter: ["aria-hidden"] });
+  });
+})();</script>"""
+
+
 @contextmanager
 def frame(session: Session, here: str) -> Iterator[None]:
     """Head, theme and the column in which a page's cards stand."""
     ui.add_css(styles())
-    ui.add_head_html('<link rel="stylesheet" href="/assets/uPlot.css">' + FOCUS)
+    ui.add_head_html('<link rel="stylesheet" href="/assets/uPlot.css">' + FOCUS + GONE)
     ui.colors(primary=PRIMARY)
     mode = ui.dark_mode(value=session.dark)
     with ui.element("header").classes("head"):
