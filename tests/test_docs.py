@@ -133,7 +133,10 @@ NAMES: dict[str, str] = {
 DEAR = [
     "README.md",
     *(f"docs/{name}.md" for name in ("bus", "diagnosis", "engine_test", "fmu", "injection", "machines")),
-    *(f"docs/{name}.md" for name in ("own_controller", "python", "real_time", "replay", "rig", "your_own_model")),
+    *(
+        f"docs/{name}.md"
+        for name in ("own_controller", "pandas", "python", "real_time", "replay", "rig", "your_own_model")
+    ),
 ]
 # the beginning of a step that takes long -> the quick test that covers what it does
 LONG: dict[str, str] = {

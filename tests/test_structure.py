@@ -112,7 +112,7 @@ LATE: dict[str, dict[str, str]] = {
     },
     "vaneloop/fleet/tables.py": {"duckdb": "extra fleet"},
     "vaneloop/pages/page.py": {"plotly.offline": "start-up: 50 ms"},
-    "vaneloop/verbs/answer.py": {"plotly.graph_objects": "start-up: 50 ms"},
+    "vaneloop/verbs/answer.py": {"matplotlib.figure": "extra notebook", "plotly.graph_objects": "start-up: 50 ms"},
     "vaneloop/verbs/machine.py": {  # a loop that runs has the machine and searches nothing
         "vaneloop.identification.vane_chain.chain": "start-up: 300 ms",
         "vaneloop.identification.vane_chain.resample": "start-up: 300 ms",

@@ -27,7 +27,7 @@ def shown(answer: Answer, folder: Path) -> str:
     """Try every way in which an answer shows itself; return the written page."""
     assert str(answer) == answer.sentence() and answer.sentence().endswith(".")
     assert answer.sentence() in html.unescape(answer._repr_html_())
-    assert len(answer.plot().data) > 0
+    assert len(answer.figure().data) > 0
     terminal.plain(answer.to_dict())
     page = answer.report(folder / "page.html", "vaneloop something").read_text(encoding="utf-8")
     assert html.escape(answer.page().verdict) in page

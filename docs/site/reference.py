@@ -166,11 +166,40 @@ def named(annotation: Any, before: str) -> str:
     return before + (annotation if isinstance(annotation, str) else inspect.formatannotation(annotation))
 
 
+def numpydoc(text: str) -> list[str]:
+    """A section of a docstring in the manner of numpydoc, as Markdown: a table of names, or an example as code."""
+    title, _, *lines = text.splitlines()
+    if title == "Examples":
+        parts = re.split(r"\n{2,}", "\n".join(lines))
+        code = [p if not p.startswith(">>>") else f"```pycon\n{p}\n```" for p in parts]
+        return [f"**{title}**", *code]
+    rows: list[list[str]] = []
+    for line in lines:
+        if not line.startswith(" ") and line.strip():
+            name, _, kind = line.partition(" : ")
+            rows.append([f"`{name}`", kind, ""])
+        elif rows:
+            rows[-1][2] += f" {line.strip()}"
+    return [f"**{title}**", table(("name", "type", "is"), rows)]
+
+
+def sections(text: str) -> tuple[str, list[str]]:
+    """What stands before the sections of numpydoc in a docstring, and each section."""
+    parts = re.split(r"\n(?=[A-Z]\w+\n-{4,}\n)", f"\n{text}")
+    return parts[0].strip("\n"), [p.rstrip() for p in parts[1:]]
+
+
 def doc(thing: Any) -> str:
-    """A docstring as Markdown: what stands in two columns becomes a table."""
+    """A docstring as Markdown: what stands in two columns becomes a table, and so do the sections of numpydoc."""
+    text, more = sections(inspect.getdoc(thing) or "")
+    return linked("\n\n".join([told(text), *(x for part in more for x in numpydoc(part))]), "../")
+
+
+def told(text: str) -> str:
+    """The words of a docstring as Markdown."""
     out = []
     row = re.compile(r"(\w+(?:, \w+)*)\s{2,}(\S.*)|(\w{2,}) ([a-z].*)")
-    for part in re.split(r"\n{2,}", inspect.getdoc(thing) or ""):
+    for part in re.split(r"\n{2,}", text):
         part = part.rstrip()
         lines = inspect.cleandoc(part).splitlines() if part.startswith(" ") else part.splitlines()
         wide = [x for x in lines if not x.startswith(" ")]
@@ -187,7 +216,7 @@ def doc(thing: Any) -> str:
             out.append(f"```text\n{inspect.cleandoc(part)}\n```")
         else:
             out.append(re.sub(r"::$", ":", part).replace("<", "&lt;"))
-    return linked("\n\n".join(out), "../")
+    return "\n\n".join(out)
 
 
 def members(thing: Any) -> list[str]:

@@ -11,36 +11,65 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hil.logs import plausible
-from hil.logs.formats import format_at, format_of
+from hil.logs.channels import Channels
+from hil.logs.dataframe import frame_columns, is_frame, name_of, open_frame
+from hil.logs.formats import format_of
 from hil.logs.guess import Files, Guess
 from hil.logs.opening import Opened, is_ours, open_log, sketch, wanted_design_speed
 from hil.logs.scale import proposed_scale
 from hil.logs.source import ABSENT, Channel, LogError, Options, Series, Source, close_names, find, is_absent
-from hil.logs.table import NoTime
-from hil.logs.units import UnitError, Units
+from hil.logs.table import NoTime, split_unit
+from hil.logs.units import Units
+from vaneloop.base.errors import meant
 from vaneloop.base.signals import UNITS
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 __all__ = ["Channel", "Log", "LogError", "offered", "read_log", "write_log"]
 
 _EPOCH = 1e8  # s; a table whose time starts three years in counts from 1970, not from the start of the log
 
 
-@dataclass(frozen=True)
-class Log:
-    """A measured run: where it is from, its channels by name, what was left out or assumed on reading, and which of
-    its names and units are guesses (each has its note, too).
+@dataclass(frozen=True, repr=False)
+class Log(Channels):
+    """A measured run. It is used as a frame of pandas is (`Channels`), and every analysis takes it.
 
     Raises LogError where a channel of the product's signals cannot be in its unit, or where the time spans more than
     the rows are worth (`hil.logs.plausible`): no command gets such a log, whoever made it.
+
+    Attributes
+    ----------
+    path : str
+        The file it was read from, or a name.
+    channels : dict
+        Each `Channel` by its name; every channel has a time of its own.
+    notes : list
+        What was left out or assumed on reading, in words.
+    signals : Mapping
+        Unit of each signal that the log may have.
+    guesses : tuple
+        Which of its names and units are guesses; each has its note, too.
+
+    Examples
+    --------
+    >>> import vaneloop
+    >>> log = vaneloop.read_log("examples/hidden_effect.parquet")
+    >>> log["x_lvdt"]
+    Channel(20,000 samples, 0 to 199.99 s, 1.874 to 44.98 mm)
+    >>> log[10:20][["x_lvdt", "i_cmd"]]
+    Log('hidden_effect.parquet', 1,000 rows, 10 to 19.99 s: x_lvdt [mm], i_cmd [mA])
+    >>> len(log), "p_s" in log, log.units["p_s"]
+    (20000, True, 'MPa')
     """
 
-    path: str
-    channels: dict[str, Channel]
     notes: list[str] = field(default_factory=list)
     signals: Mapping[str, str] = field(default_factory=lambda: UNITS, repr=False)
     guesses: tuple[Guess, ...] = ()
@@ -53,8 +82,78 @@ class Log:
         _refuse_units(self.path, wrong)
         times = [c.t for c in self.channels.values() if c.t.size]
         if times and (why := plausible.span_complaint(times)):
-            unit = plausible.unit_of_time(max(times, key=len))
-            raise LogError(f"{self.path}: {why}; --unit t={unit}, if time counts in {unit}")
+            raise LogError(f"{self.path}: {why}; --unit t=ms, if time counts in ms")
+        own = {name: c if c.unit else replace(c, unit=self.signals.get(name, "")) for name, c in self.channels.items()}
+        object.__setattr__(self, "channels", own)
+
+    @classmethod
+    def from_dataframe(
+        cls,
+        frame: DataFrame,
+        *,
+        units: Mapping[str, str] | None = None,
+        mapping: Mapping[str, str] | None = None,
+        design_rpm: float | None = None,
+        name: str = "",
+    ) -> Log:
+        """Take a ``pandas.DataFrame`` as it is: every column of numbers is a channel, and nothing is guessed.
+
+        `read_log` takes a frame as it takes a file, and guesses which column is which signal of the vane machine.
+
+        Parameters
+        ----------
+        frame : pandas.DataFrame
+            Its time is the index, or a column called ``t``, ``time`` or the like; dates and durations become s. NaN is
+            no sample. What ``attrs["units"]`` says of a column is its unit.
+        units : Mapping, optional
+            Column (or signal) -> unit, such as ``{"x_lvdt": "um"}``; goes before what the frame says. A signal of the
+            product is brought to its own unit, any other keeps what is stated.
+        mapping : Mapping, optional
+            Column -> name that it gets.
+        design_rpm : float, optional
+            Design speed, rpm; needed where a rotor speed is not in %.
+        name : str, optional
+            What messages call the log; default: ``attrs["name"]``.
+
+        Returns
+        -------
+        Log
+
+        Raises
+        ------
+        LogError
+            One line, for a frame without a time, or with values that no sensor can give.
+
+        Examples
+        --------
+        >>> import pandas as pd
+        >>> from vaneloop import Log
+        >>> frame = pd.DataFrame({"t": [0.0, 0.1, 0.2], "x_lvdt": [20e3, 20.5e3, 21e3], "pump": [1.0, 1.1, 1.2]})
+        >>> log = Log.from_dataframe(frame, units={"x_lvdt": "um", "pump": "V"}, name="bench")
+        >>> log
+        Log('bench', 3 rows, 0 to 0.2 s: x_lvdt [mm], pump [V])
+        >>> log["x_lvdt"].values.tolist()
+        [20.0, 20.5, 21.0]
+        """
+        if not is_frame(frame):
+            raise LogError(f"from_dataframe: {type(frame).__name__} is given; allowed: a pandas.DataFrame")
+        names, given, signals = dict(mapping or {}), dict(units or {}), dict[str, str]()
+        said = name or name_of(frame)
+        for column, unit in frame_columns(frame).items():
+            signal = names.get(column, split_unit(column)[0])
+            own = given.pop(column, "") or given.get(signal) or unit
+            signals[signal] = UNITS.get(signal, own)
+            if own:
+                given[signal] = own
+        signals.pop("t", None)
+        if odd := next((k for k in given if k not in signals and k != "t"), None):
+            raise LogError(f"{said}: unit of {odd!r}: is no column of numbers{meant(odd, signals)}")
+        if odd := next((k for k, v in names.items() if v not in signals and v != "t"), None):
+            raise LogError(f"{said}: mapping of {odd!r}: is no column of numbers{meant(odd, signals)}")
+        return read_log(
+            frame, mapping=names, units=given, design_rpm=design_rpm, require=(), signals=signals, guess=False,
+            name=name,
+        )  # fmt: skip
 
 
 def _refuse_units(path: str | Path, wrong: list[tuple[str, str, str, np.ndarray]]) -> None:
@@ -160,40 +259,70 @@ def _clean(path: Path, signal: str, key: str, s: Series, in_order: bool, notes: 
 
 
 def read_log(
-    path: str | Path,
+    path: str | Path | DataFrame,
     *,
     dbc: str | Path | None = None,
     mapping: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
     design_rpm: float | None = None,
-    require: Iterable[str] = ("n_dem",),
+    require: Iterable[str] | None = None,
     signals: Mapping[str, str] = UNITS,
     guess: bool = True,
     mapping_file: str | Path | None = None,
     tables: Files | None = None,
-    part: int = 0,
+    name: str = "",
 ) -> Log:
-    """Read a log of any format into channels with the product's names and units.
+    """Read a log of any format, or a ``pandas.DataFrame``, into channels with the product's names and units.
 
-    path        the file; its suffix says the format
-    dbc         database of a CAN log; default: tables/vgv.dbc
-    mapping     name in the log -> signal, {"N1_DEM": "n_dem"}; a CAN name may be MESSAGE.SIGNAL, an MDF name
-                GROUP.CHANNEL
-    units       signal -> unit that the log uses for it, {"n_r": "rpm"}; goes before a unit in the file
-    design_rpm  design speed, rpm; needed where a rotor speed is not in %
-    require     signals without which the log is of no use; each needs two samples
-    signals     name -> unit of all signals to look for; default: the product's
-    guess       guess names and units that nobody states (`hil.logs.guess`), each with a note; not with a mapping file
-    mapping_file  names, units, design speed and database of a bench (`hil.logs.mapping`); what is given beside it goes
-                before
-    tables      the machine's own tables, against whose schedule guesses are held: name without suffix -> file;
-                default: the shipped ones
-    part        which run of a table in which the header stands again, from 1; 0: all where time goes on, else the
-                longest
+    Parameters
+    ----------
+    path : str, Path or pandas.DataFrame
+        The file; its suffix says the format. A frame is read as a table is; its time is the index, or a column.
+    dbc : str or Path, optional
+        Database of a CAN log; default: tables/vgv.dbc.
+    mapping : Mapping, optional
+        Name in the log -> signal, ``{"N1_DEM": "n_dem"}``; a CAN name may be MESSAGE.SIGNAL, an MDF name GROUP.CHANNEL.
+    units : Mapping, optional
+        Signal -> unit that the log uses for it, ``{"n_r": "rpm"}``; goes before a unit in the file.
+    design_rpm : float, optional
+        Design speed, rpm; needed where a rotor speed is not in %.
+    require : iterable of str, optional
+        Signals without which the log is of no use; each needs two samples. Default: ``n_dem``, where it is one of
+        ``signals``.
+    signals : Mapping, optional
+        Name -> unit of all signals to look for; default: the product's.
+    guess : bool, optional
+        Guess names and units that nobody states (`hil.logs.guess`), each with a note; not with a mapping file.
+    mapping_file : str or Path, optional
+        Names, units, design speed and database of a bench (`hil.logs.mapping`); what is given beside it goes before.
+    tables : Mapping, optional
+        The machine's own tables, against whose schedule guesses are held: name without suffix -> file; default: the
+        shipped ones.
+    name : str, optional
+        What messages call a frame; default: its ``attrs["name"]``.
 
-    Raises LogError, one line, for whatever cannot be used.
+    Returns
+    -------
+    Log
+
+    Raises
+    ------
+    LogError
+        One line, for whatever cannot be used.
+
+    Examples
+    --------
+    >>> import vaneloop
+    >>> log = vaneloop.read_log("examples/hidden_effect.parquet")
+    >>> frame = log.to_pandas()
+    >>> frame["x_lvdt"].iloc[:3].round(2).tolist()
+    [27.12, 27.12, 27.1]
+    >>> vaneloop.read_log(frame).columns == log.columns
+    True
     """
-    path, require = Path(path), tuple(require)
+    opened = partial(open_frame, path) if is_frame(path) else None
+    path = Path(name or name_of(path)) if is_frame(path) else Path(path)
+    require = tuple(r for r in ("n_dem",) if r in signals) if require is None else tuple(require)
     for what, given in (("unit of", dict(units or {})), ("required", dict.fromkeys(require))):
         for signal in given:
             if signal not in signals and signal != "t":
@@ -204,7 +333,7 @@ def read_log(
     if design_rpm is not None and not (math.isfinite(design_rpm) and design_rpm > 0):
         raise LogError(f"{path}: design speed (={design_rpm:g} rpm) must be finite and above 0")
 
-    log = open_log(path, dbc, mapping, units, design_rpm, signals, guess, mapping_file, tables or {}, part)
+    log = open_log(path, dbc, mapping, units, design_rpm, signals, guess, mapping_file, tables or {}, opened)
     source, named, notes, units = log.source, log.named, log.notes, log.units
     if log.guesses.rpm:
         speed, _, words = wanted_design_speed(path, log)

@@ -4,7 +4,7 @@ guessed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -103,9 +103,12 @@ def open_log(
     guess: bool,
     mapping_file: str | Path | None,
     tables: Files,
-    part: int = 0,
+    opened: Callable[[Path, Options], Source] | None = None,
 ) -> Opened:
-    """Open a log and find its names, guessed where nobody states them; arguments as of `read_log`."""
+    """Open a log and find its names, guessed where nobody states them; arguments as of `read_log`.
+
+    opened  what opens it; default: its format, by its suffix
+    """
     bench = read_mapping(mapping_file, signals) if mapping_file is not None else Bench()
     guess = guess and mapping_file is None  # a mapping file says it all
     dbc, design_rpm = dbc or bench.dbc, design_rpm or bench.design_rpm
@@ -114,7 +117,7 @@ def open_log(
     given = _pairs(path, mapping, signals)
     named = {**bench.names, **given}
     options = Options(Path(dbc) if dbc is not None else None, {name: signal for signal, name in named.items()}, guess)
-    source = format_at(path).open(path, options)
+    source = (opened or format_of(path).open)(path, options)
     absent = {s: n for s, n in bench.names.items() if s not in given and s != "t" and not find(source, n, True)}
     for signal in absent:
         del named[signal]

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from hil.logs.channels import Channel
 from hil.logs.errors import LogError
 
 __all__ = [
@@ -22,18 +23,6 @@ __all__ = [
 ]  # fmt: skip
 
 MAX_FILE = 4 << 30  # bytes; a CAN log beyond this is split by every logger
-
-
-@dataclass(frozen=True)
-class Channel:
-    """Samples of one signal: t in s, strictly increasing; values in the signal's unit, finite.
-
-    framed  it came in the frames of a bus: a value holds from its frame on. Else it was polled, sampled or resampled.
-    """
-
-    t: np.ndarray
-    values: np.ndarray
-    framed: bool = False
 
 
 @dataclass(frozen=True)

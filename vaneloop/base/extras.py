@@ -21,6 +21,7 @@ EXTRAS = {
     "multibody": {"exudyn": "exudyn"},
     "secoc": {"cryptography": "cryptography"},
     "gpu": {"numba_cuda": "numba-cuda"},
+    "notebook": {"pandas": "pandas", "matplotlib": "matplotlib"},
 }  # fmt: skip
 
 

@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
+from vaneloop.identification.least_squares.problem import NINETY, Fit, LeastSquaresProblem
 from vaneloop.identification.selection.calibration import trust
-from vaneloop.identification.selection.rules import Decision
-from vaneloop.identification.subsystem import Array, Stage
+from vaneloop.identification.subsystem import Array, Parameter, Stage
 
 __all__ = [
-    "Candidate", "Found", "StageDiagnosis", "answer_of", "at_bound", "found_of", "parameters_of", "recalibrated",
-    "rms_of", "rms_per_output", "weigh",
+    "Candidate", "Estimate", "Found", "StageDiagnosis", "answer_of", "at_bound", "estimates", "found_of",
+    "interval_of", "parameters_of", "recalibrated", "rms_of", "rms_per_output", "weigh",
 ]  # fmt: skip
 
 
@@ -126,16 +125,59 @@ def at_bound(stage: Stage, fit: Fit, name: str) -> bool:
     return False
 
 
+def interval_of(p: Parameter, fit: Fit, k: int) -> tuple[float, float]:
+    """The 90 % interval of a fit's free parameter number ``k``, as far as its physical bounds let it reach."""
+    low, high = float(fit.low[k]), float(fit.high[k])
+    return (low, high) if p.period else (max(low, p.low), min(high, p.high))
+
+
 def parameters_of(stage: Stage, fit: Fit, name: str) -> dict[str, dict[str, object]]:
     """Fitted parameters of an effect with their 90 % intervals."""
     columns = stage.index()[name]
     out: dict[str, dict[str, object]] = {}
     for i, p in zip(range(columns.start, columns.stop), stage.effect(name).parameters, strict=True):
-        k = int(np.flatnonzero(fit.free == i)[0])
-        low, high = float(fit.low[k]), float(fit.high[k])
-        if not p.period:
-            low, high = max(low, p.low), min(high, p.high)
+        low, high = interval_of(p, fit, int(np.flatnonzero(fit.free == i)[0]))
         out[p.name] = {"value": float(fit.theta[i]), "low": low, "high": high, "unit": p.unit}
+    return out
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter as it was fitted.
+
+    effect   the effect that it belongs to; "": the model's own
+    stderr   standard error; NaN at a bound, where a fit tells none
+    low, high  90 % interval, within the physical bounds
+    bound    what the fit could take: lowest and highest value
+    at_bound whether it stands at one of them
+    """
+
+    stage: str
+    effect: str
+    name: str
+    value: float
+    stderr: float
+    low: float
+    high: float
+    unit: str
+    bound: tuple[float, float]
+    at_bound: bool
+
+
+def estimates(judge: LeastSquaresProblem, fit: Fit) -> list[Estimate]:
+    """Every free parameter of a fit, in the order of ``fit.free``."""
+    stage, (lowest, highest) = judge.stage, judge.bounds()
+    effect_of = {i: name for name, columns in stage.index().items() for i in range(columns.start, columns.stop)}
+    out, every = [], stage.all_parameters()
+    for k, i in enumerate(fit.free):
+        p, value = every[i], float(fit.theta[i])
+        bound = float(lowest[i]), float(highest[i])
+        at = value <= bound[0] or value >= bound[1]
+        stderr = np.nan if at else 0.5 * float(fit.high[k] - fit.low[k]) / NINETY
+        effect = effect_of.get(int(i), "")
+        out.append(
+            Estimate(stage.name, effect, p.name, value, stderr, *interval_of(p, fit, k), p.unit, bound, at)
+        )  # fmt: skip
     return out
 
 
@@ -160,6 +202,7 @@ def recalibrated(stage: Stage, fit: Fit) -> list[dict[str, object]]:
             low, high, value = float(fit.low[k]), float(fit.high[k]), float(fit.theta[c])
             if not low <= p.value <= high:
                 limit = abs(value - p.expected) >= 0.999 * p.tolerance  # the data pull on beyond what it allows
+                low, high = interval_of(p, fit, k)
                 moved: dict[str, object] = {"parameter": p.name, "value": value, "low": low, "high": high}
                 out.append(moved | {"unit": p.unit, "at_limit": bool(limit)})
     return out

@@ -13,6 +13,7 @@ from plant import write_model
 from plant.model import Learned as Table
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import write
+from vaneloop.base.signals import heading
 from vaneloop.identification import StageError, System
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import answer_of, found_of, recalibrated, rms_of
@@ -35,12 +36,16 @@ from vaneloop.pages.decisions import Explained
 from vaneloop.pages.learned import learned_page
 from vaneloop.pages.story import floors
 from vaneloop.pages.style import capital
-from vaneloop.verbs.answer import Answer
+from vaneloop.verbs.answer import COLOUR, Answer, Row, axes, labelled
+from vaneloop.verbs.curves import Curves, curves_of_logs
+from vaneloop.verbs.estimates import Fitted
 from vaneloop.verbs.machine import Machine
 from vaneloop.verbs.search import Diagnosed, chain_for, diagnose, not_given, with_fits
 from vaneloop.verbs.search import diagnosed as of_chain
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from plant import Model
     from vaneloop.identification.least_squares.problem import Fit
     from vaneloop.identification.results import StageDiagnosis
@@ -49,11 +54,12 @@ if TYPE_CHECKING:
     from vaneloop.identification.unmodelled.learned_law import LearnedLaw
     from vaneloop.identification.vane_chain.chain import Chain
     from vaneloop.pages.page import Page
+    from vaneloop.verbs.parts import AnyLog, Parts
 
 __all__ = ["Learned", "learn"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False, eq=False)
 class Learned(Answer):
     """Laws learned, or why none was.
 
@@ -62,7 +68,7 @@ class Learned(Answer):
     by_log     errors before and after, log by log, where one was
     model      the model with them, to be written; None: none was learned
     steps      channel -> step (border unit) in which its reading comes, where its converter's low bits are lost
-    decisions  subsystem -> what the acceptance rules said of each candidate
+    fits       of each stage that a law was learned in: the model with its laws
     """
 
     diagnosed: Diagnosed
@@ -73,7 +79,7 @@ class Learned(Answer):
     log: str = ""
     path: str = ""
     steps: Mapping[str, float] = field(default_factory=dict)
-    decisions: Mapping[str, Sequence[Decision]] = field(default_factory=dict, repr=False)
+    fits: tuple[Fitted, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -95,9 +101,9 @@ class Learned(Answer):
         before, after = self.laws[0].error_before, self.laws[-1].error_after
         return f"{capital(text)}. Held-out error in noise floors: {floors(before)} to {floors(after)}."
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """The answer as the JSON of ``vaneloop learn``."""
-        out: dict[str, Any] = {
+        out: dict[str, object] = {
             "schema": 1, "log": self.log, "verdict": self.verdict, "sentence": self.sentence(),
             "laws": [law_json(law) for law in self.laws], "nearest": self.outcome.nearest, "model": self.path,
             "named": self.diagnosed.effects, "notes": self.notes,
@@ -105,6 +111,38 @@ class Learned(Answer):
         out["decisions"] = [one for name, of in self.decisions.items() for one in decisions_json(of, stage=name)]
         out |= {"steps": dict(self.steps)} if self.steps else {}
         return out | ({"logs": self.by_log.json()["logs"]} if self.by_log else {})
+
+    def rows(self) -> list[Row]:
+        """A row for each law: where it acts, of what it is a function, and what it does to the error."""
+        return [
+            {
+                "effect": law.name, "how": law.how, "at": law.at, "of": law.of, "unit": law.unit,
+                "error_before": law.error_before, "error_after": law.error_after,
+                "formula": law.spoken.text if law.spoken else "",
+            }
+            for law in self.laws
+        ]  # fmt: skip
+
+    def _fits(self) -> Sequence[Fitted]:
+        return self.fits or self.diagnosed._fits()
+
+    def _worked_out(self) -> Curves:
+        if self.by_log is None:
+            return super()._worked_out() if self.fits else self.diagnosed._curves
+        d = self.by_log.d
+        return curves_of_logs(self.by_log.logs, d.final.theta, d.base.theta, self.log)
+
+    def plot(self, ax: Axes | None = None, *, signal: str = "", residuals: bool = False) -> Axes:
+        """Draw the first law over its quantity, with its 90 % band; with a signal, or where none was learned, as of
+        any answer.
+        """
+        law = next((law for law in self.laws if not isinstance(law, LearnedSurface)), None)
+        if law is None or signal or residuals:
+            return super().plot(ax, signal=signal, residuals=residuals)
+        ax = axes(ax)
+        ax.fill_between(law.x, law.low, law.high, color=COLOUR["model"], alpha=0.25, label="90 % band")
+        ax.plot(law.x, law.y, color=COLOUR["model"], label=law.name)
+        return labelled(ax, heading(f"{law.how} at {law.at}", law.unit), heading(law.of, law.of_unit))
 
     @property
     def explained(self) -> dict[str, Explained]:
@@ -164,11 +202,11 @@ def law_json(law: LearnedLaw) -> dict[str, Any]:
 
 
 def learn(
-    log: Any,
+    log: AnyLog,
     model: Machine | System | None = None,
     *,
-    fit: Any = (),
-    test: Any = (),
+    fit: Parts = (),
+    test: Parts | AnyLog = (),
     added: Model | None = None,
     without: Sequence[str] = (),
     shape: Sequence[str] = (),
@@ -176,14 +214,48 @@ def learn(
     workers: int = 2,
     progress: Callable[[float], None] | None = None,
 ) -> Learned:
-    """Which law does a model lack that nobody listed? Arguments as of `vaneloop.diagnose`.
+    """Which law does a model lack that nobody listed?
 
-    shape  what is known of every curve: "zero" where its quantity is 0, "odd", "rising", "falling"
-    formulas  whether a formula that does as well as its curve is the law
+    The library of named laws is searched first; a learned law must do clearly better than the best of them.
 
-    The library of named laws is searched first; a learned law must do clearly better than the best of them. Raises
-    InputError for logs that the system cannot be held against.
+    Parameters
+    ----------
+    log, model, fit, test, added, without, workers, progress
+        As of `diagnose`.
+    shape : sequence of str, optional
+        What is known of every curve: "zero" where its quantity is 0, "odd", "rising", "falling".
+    formulas : bool, optional
+        Whether a formula that does as well as its curve is the law.
+
+    Returns
+    -------
+    Learned
+        Its ``verdict`` is learned, named, none or unknown; ``laws`` are the curves, `rows` a table of them; ``write``
+        writes the model with them.
+
+    Raises
+    ------
+    InputError
+        One line, for logs that the model cannot be held against.
+
+    Examples
+    --------
+    An amplifier whose reading ripples, which no law of the library says:
+
+    >>> import numpy as np, pandas as pd, vaneloop
+    >>> system = vaneloop.System(
+    ...     "amplifier", "static", lambda u, p: p.gain * u.u, inputs={"u": "V"}, outputs={"y": "V"},
+    ...     parameters=[vaneloop.unknown("gain", 1.0, "-")], places=["output"],
+    ... )
+    >>> t = np.arange(0.0, 20.0, 0.02)
+    >>> u = np.sin(0.4 * t) + 0.7 * np.sin(1.7 * t + 1.0)
+    >>> y = 2.0 * u + 0.4 * np.cos(5.0 * u) + 0.01 * np.random.default_rng(1).standard_normal(len(t))
+    >>> answer = vaneloop.learn(pd.DataFrame({"u": u, "y": y}, index=t), system)
+    >>> answer.verdict, [(row["at"], row["of"], row["unit"]) for row in answer.rows()]
+    ('learned', [('y', 'y', 'V')])
     """
+    if isinstance(shape, str):
+        raise InputError(f"shape (={shape!r}) must be a list of {', '.join(SHAPES)}")
     tell, shape = progress or (lambda _: None), checked_shape(shape)
     if not isinstance(model, System):
         machine = model or Machine()
@@ -222,8 +294,7 @@ def learned(
     stages = found.diagnosis.stages
     open_ones = [s for s in stages if _open(chain, s)]
     laws: list[LearnedLaw] = []
-    model, said, out = before, [], None
-    decisions: dict[str, list[Decision]] = {}
+    model, said, out, fits = before, [], None, list[Fitted]()
     for i, d in enumerate(open_ones):
         stage = chain.stage(d.stage)
         if stage.coarse:  # what it would learn is how the steps look from there
@@ -259,6 +330,7 @@ def learned(
         if new:
             kept = replace(one, tried=[one.tried[k] for k in new])
             model = _with_stage(_as_model(model, kept, [own[k] for k in new], last), last.judge, last.fit)
+            fits.append(Fitted(last.judge, last.fit, nominal_of(last)))
     unknown = any(s.verdict == "unknown" for s in open_ones)
     verdict = "learned" if laws else "unknown" if unknown else "named" if found.effects else "none"
     why = {
@@ -269,7 +341,12 @@ def learned(
         model = with_fits(model, [s for s in stages if s.verdict == "missing"])
     outcome = Outcome(verdict, nearest=out.nearest if out else [], why=why, notes=said if laws else [])
     tell(1.0)
-    return Learned(found, outcome, laws, None, model if laws else None, log, steps=chain.steps, decisions=decisions)
+    return Learned(found, outcome, laws, None, model if laws else None, log, steps=chain.steps, fits=tuple(fits))
+
+
+def nominal_of(last: FittedCandidate) -> Fit:
+    """The fit without its curves and laws: what the nominal model leaves."""
+    return last.judge.fit((), last.judge.stage.neutral(), 1)
 
 
 def _open(chain: Chain, d: StageDiagnosis) -> bool:
@@ -333,7 +410,7 @@ def _learned(
     by_log = ByLog.of(on_logs(logs, last.curves), d, added)
     model = _as_model(by_log.model, outcome, laws, last)
     progress(1.0)
-    return Learned(diagnosed, outcome, laws, by_log, model, diagnosed.log, decisions=decisions)
+    return Learned(diagnosed, outcome, laws, by_log, model, diagnosed.log, fits=(Fitted(judge, last.fit, base),))
 
 
 def _beside_named(

@@ -3,27 +3,33 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from hil.logs import read_log
+from hil.logs import Log, LogError, read_log
 from hil.logs.held import held
-from vaneloop.base.errors import InputError
+from hil.logs.units import NO_UNIT, factor_of
+from vaneloop.base.errors import InputError, meant
 from vaneloop.base.spans import Span, apart, is_span, spans_of
 from vaneloop.identification import Record, StageError, System
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.subsystem import Array
 from vaneloop.verbs.long import carried, held_against
+from vaneloop.verbs.replay import a_log
 
 if TYPE_CHECKING:
-    from hil.logs import Log
     from vaneloop.verbs.machine import Machine
+    from vaneloop.verbs.replay import LogLike
 
-__all__ = ["Tested", "bind_parts", "part_of", "read_record", "records_of", "split", "tested"]
+__all__ = ["AnyLog", "Parts", "Tested", "bind_parts", "part_of", "read_record", "records_of", "split", "tested"]
+
+Part: TypeAlias = "tuple[float | None, float | None] | str"  # of a log: from, to in s; None an open end
+Parts: TypeAlias = "Part | Sequence[Part]"
+AnyLog: TypeAlias = "LogLike | Record | Sequence[LogLike | Record]"  # one or several logs, of a user's own system
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,7 @@ class Tested:
     samples: int
 
 
-def split(fit: Any, test: Any) -> tuple[list[Span], list[Span], list[Any]]:
+def split(fit: Parts, test: Parts | AnyLog) -> tuple[list[Span], list[Span], list[Any]]:
     """Parts to fit, parts to test, and what else is to test: logs of their own. Raises InputError, one line."""
     listed = [test] if is_span(test) or not isinstance(test, Sequence) or isinstance(test, str) else list(test)
     to_fit = spans_of(fit, "--fit")
@@ -67,15 +73,11 @@ def part_of(log: Log, spans: Sequence[Span]) -> Log:
     """A log's samples within these parts; without parts, the log."""
     if not spans:
         return log
-    longest = max((c.t for c in log.channels.values()), key=len)
+    longest = max((c.t for c in log.values()), key=len)
     for span in spans:
         _inside(longest, span, log.path)
-    channels = {}
-    for name, c in log.channels.items():
-        use = np.any([(c.t >= s.low) & (c.t < s.high) for s in spans], axis=0)
-        if np.count_nonzero(use) > 1:
-            channels[name] = dataclasses.replace(c, t=c.t[use], values=c.values[use])
-    return dataclasses.replace(log, channels=channels)
+    part = log.within(list(spans))
+    return part[[name for name, c in part.items() if len(c) > 1]]
 
 
 def bind_parts(machine: Machine, log: Log, fit: Sequence[Span], test: Sequence[Span]) -> Any:
@@ -125,23 +127,27 @@ def _inside(t: Array, span: Span, name: str) -> Array:
     return np.asarray(use)
 
 
-def read_record(path: str | Path, system: System, **reading: Any) -> tuple[Record, list[str]]:
+def read_record(log: LogLike, system: System, **reading: Any) -> tuple[Record, list[str]]:
     """Read a log as a system wants it, by its own ``read`` or by ours; return it and what there is to note.
 
+    log      a file's name, a frame, or what has been read of one
     reading  arguments of `hil.logs.read_log`: dbc, mapping, units, design_rpm
     """
-    name = Path(path).name
-    if system.read is not None:
-        return Record(name, *_by_its_own_reader(str(path), system)), []
+    if system.read is not None and isinstance(log, str | Path):
+        return Record(Path(log).name, *_by_its_own_reader(str(log), system)), []
     motion = {c: system.units.get("position", "") for c in (system.position,) if c} | {
         c: "" for c in (system.velocity,) if c
     }
     signals = {**motion, **system.inputs, **system.outputs}
-    log = read_log(path, **reading, require=[c for c in signals if c not in system.optional()], signals=signals)
-    reference = max((log.channels[c] for c in system.outputs if c in log.channels), key=lambda c: len(c.t))
+    needed = [c for c in signals if c not in system.optional()]
+    if isinstance(log, Log):
+        read = _in_units(log, signals, needed)
+    else:
+        read = read_log(a_log(log), **reading, require=needed, signals=signals)
+    reference = max((read.channels[c] for c in system.outputs if c in read), key=lambda c: len(c.t))
     t = reference.t
     columns = {}
-    for c, channel in log.channels.items():
+    for c, channel in read.items():
         step = float(np.median(np.diff(channel.t))) if len(channel.t) > 1 else 0.0
         holds = c in system.inputs and channel.framed and system.holds
         v = channel.values[held(channel, t)] if holds else np.interp(t, channel.t, channel.values)
@@ -149,7 +155,29 @@ def read_record(path: str | Path, system: System, **reading: Any) -> tuple[Recor
             i = np.clip(np.searchsorted(channel.t, t), 1, len(channel.t) - 1)
             v[np.minimum(np.abs(channel.t[i] - t), np.abs(t - channel.t[i - 1])) > 1.5 * step] = np.nan
         columns[c] = v
-    return Record(name, t, columns), [f"{name}: {note}" for note in log.notes]
+    name = Path(read.path).name
+    return Record(name, t, columns), [f"{name}: {note}" for note in read.notes]
+
+
+def _in_units(log: Log, signals: Mapping[str, str], needed: Sequence[str]) -> Log:
+    """The channels of a log that a system has a use for, each in the system's unit.
+
+    Raises LogError where one is missing, or where its unit does not convert.
+    """
+    if missing := next((c for c in needed if c not in log or len(log[c]) < 2), None):
+        raise LogError(f"{log.path}: no {missing}{meant(missing, log)}; it has {', '.join(log)}")
+    channels = {}
+    for name, unit in signals.items():
+        if name not in log:
+            continue
+        c = log[name]
+        told = unit != c.unit and not {unit.casefold(), c.unit.casefold()} & set(NO_UNIT)
+        factor = factor_of(c.unit, unit) if told else (1.0, 0.0)
+        if not isinstance(factor, tuple):
+            raise LogError(f"{log.path}: {name} is in {c.unit}; allowed: {unit} or what converts to it")
+        values = c.values if factor == (1.0, 0.0) else factor[0] * c.values + factor[1]
+        channels[name] = dataclasses.replace(c, values=values, unit=unit)
+    return Log(log.path, channels, log.notes, signals)
 
 
 def _by_its_own_reader(path: str, system: System) -> tuple[Any, dict[str, Any]]:

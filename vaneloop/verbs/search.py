@@ -17,7 +17,9 @@ from plant import write_model
 from plant.curve import PLACES
 from plant.effects import EFFECTS
 from vaneloop.base.errors import InputError
+from vaneloop.base.signals import heading
 from vaneloop.identification import Record, StageError, System
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.regimes import Located
 from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance
 from vaneloop.identification.user_models.by_log import ByLog, as_given, bind
@@ -41,22 +43,27 @@ from vaneloop.pages.diagnosis import (
     located_sentence,
     verdict_sentence,
 )
-from vaneloop.pages.story import extended_sentence, reached
-from vaneloop.verbs.answer import Answer
+from vaneloop.pages.story import EXPLAINED, MISSING, extended_sentence, reached
+from vaneloop.verbs.answer import COLOUR, Answer, Row, axes, labelled
+from vaneloop.verbs.curves import Curves, curves_of_logs
+from vaneloop.verbs.estimates import Fitted
 from vaneloop.verbs.long import Held, changed, held_results, searched
 from vaneloop.verbs.long import located as located_of
 from vaneloop.verbs.machine import Machine, with_law_files
 from vaneloop.verbs.parts import Tested, bind_parts, read_record, records_of, split, tested
-from vaneloop.verbs.replay import log_of
+from vaneloop.verbs.replay import brief, log_of
 
 if TYPE_CHECKING:
-    from hil.logs import Log
+    from matplotlib.axes import Axes
+
     from plant import Model
     from vaneloop.identification.results import StageDiagnosis
-    from vaneloop.identification.subsystem import Bound
+    from vaneloop.identification.subsystem import Bound, Stage
     from vaneloop.identification.user_models.by_log import Logs
     from vaneloop.identification.vane_chain.chain import Chain
     from vaneloop.pages.page import Page
+    from vaneloop.verbs.parts import AnyLog, Parts
+    from vaneloop.verbs.replay import LogLike
 
 __all__ = [
     "Diagnosed", "Experiment", "Extended", "Stages", "chain_for", "compare", "diagnose", "experiment", "extend",
@@ -66,7 +73,7 @@ __all__ = [
 Progress = Callable[[float], None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False, eq=False)
 class Stages(Answer):
     """Every stage on its own logged inputs, nothing added: how large its error is, where it fails, since when.
 
@@ -93,19 +100,43 @@ class Stages(Answer):
         """Whether any stage's error is more than noise."""
         return any(x.fails for x in self.located) or bool(self.held and self.held.failing)
 
+    @property
+    def verdict(self) -> str:
+        """Agrees or fails."""
+        return "fails" if self.fails else "agrees"
+
     def sentence(self) -> str:
         """The answer in one sentence."""
         return located_sentence(self.located, self.bound.not_observed, self.held.failing if self.held else ())
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """The answer as the JSON of ``vaneloop locate``."""
-        out: dict[str, Any] = {"schema": 1, "log": self.log, "stages": [x.json() for x in self.located]}
+        out: dict[str, object] = {"schema": 1, "log": self.log, "stages": [x.json() for x in self.located]}
         out |= {"not_observed": self.bound.not_observed, "notes": self.bound.notes} | _tested_json(self.tested)
         out |= {"whole": self.held.json()} if self.held else {}
         if self.by_log is not None:
             signals = [{**f.json(), "reference": "measured"} for x in self.located for f in x.signals]
-            out |= {"signals": signals, **self.by_log.json(), "verdict": "fails" if self.fails else "agrees"}
+            out |= {"signals": signals, **self.by_log.json(), "verdict": self.verdict}
         return out
+
+    def rows(self) -> list[Row]:
+        """A row for each signal: its error, RMS, and in noise floors."""
+        return [
+            {
+                "subsystem": x.stage, "signal": f.signal, "unit": f.unit, "rms": f.rms, "rms_as_given": f.rms_as_given,
+                "noise_floor": f.noise_floor, "ratio": f.ratio, "samples": f.samples, "fails": x.fails,
+            }
+            for x in self.located for f in x.signals
+        ]  # fmt: skip
+
+    def _fits(self) -> list[Fitted]:
+        return [Fitted(LeastSquaresProblem(_stage(self.bound, x.stage), x.floor), x.fit, x.fit) for x in self.located]
+
+    def _worked_out(self) -> Curves:
+        if self.by_log is None:
+            return super()._worked_out()
+        theta = self.located[0].fit.theta
+        return curves_of_logs(self.by_log.logs, theta, theta, self.log)
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
@@ -113,7 +144,7 @@ class Stages(Answer):
         return compare_page(self.located, self.bound, command, self.log, self.by_log, self.tested, title)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False, eq=False)
 class Diagnosed(Answer):
     """What each stage lacks: effects with probability, parameters and rivals, or "unknown" with its shape.
 
@@ -141,24 +172,51 @@ class Diagnosed(Answer):
     @property
     def effects(self) -> list[str]:
         """Names of the effects named as missing, the most probable first."""
-        return [str(e["effect"]) for e in self.to_dict()["effects"]]
+        return [str(e["effect"]) for e in diagnosis_json(self.diagnosis, self.log)["effects"]]
 
     def sentence(self) -> str:
         """The answer in one sentence."""
         return verdict_sentence(self.diagnosis, self.by_log)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """The answer as the JSON of ``vaneloop diagnose``."""
         by_log = self.by_log.json() if self.by_log else {}
         whole = {"whole": self.held.json()} if self.held else {}
         return diagnosis_json(self.diagnosis, self.log) | by_log | _tested_json(self.tested) | whole
+
+    def rows(self) -> list[Row]:
+        """A row for each signal: its held-out error without and with what was found, RMS."""
+        return [
+            {
+                "subsystem": s.stage, "verdict": self._word(s), "signal": signal, "unit": s.units[k],
+                "error_before": float(s.error_before[k]), "error_after": float(s.error_after[k]),
+                "noise_floor": float(s.floor[k]), "effects": ", ".join(f.effect for f in s.effects),
+            }
+            for s in self.diagnosis.stages for k, signal in enumerate(s.outputs)
+        ]  # fmt: skip
+
+    def _word(self, s: StageDiagnosis) -> str:
+        """What a stage says, as the JSON has it."""
+        return s.verdict
+
+    def _fits(self) -> list[Fitted]:
+        return [
+            Fitted(LeastSquaresProblem(_stage(self.bound, s.stage), s.floor), s.final, s.base)
+            for s in self.diagnosis.stages
+        ]
+
+    def _worked_out(self) -> Curves:
+        if self.by_log is None:
+            return super()._worked_out()
+        d = self.by_log.d
+        return curves_of_logs(self.by_log.logs, d.final.theta, d.base.theta, self.log)
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
         return diagnosis_page(self.diagnosis, self.bound, command, self.log, by_log=self.by_log, tested=self.tested)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False, eq=False)
 class Extended(Diagnosed):
     """The model with effects added and fitted.
 
@@ -176,6 +234,14 @@ class Extended(Diagnosed):
         """Whether each stage extended stands at its noise floor."""
         return all(map(reached, self.diagnosis.stages))
 
+    @property
+    def verdict(self) -> str:
+        """Explained: the error of each stage extended is noise by now; else missing."""
+        return EXPLAINED if self.reached and not self.refused else MISSING
+
+    def _word(self, s: StageDiagnosis) -> str:
+        return EXPLAINED if s.effects and reached(s) and not self.refused else s.verdict
+
     def sentence(self) -> str:
         """The answer in one sentence."""
         return extended_sentence(self.diagnosis, self.refused)
@@ -184,10 +250,14 @@ class Extended(Diagnosed):
         """The answer as a page."""
         return extended_page(self.diagnosis, self.bound, command, self.log, self.refused, self.by_log, self.tested)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """The answer as the JSON of ``vaneloop extend``."""
         waterfall = {r.stage: [{"step": n, "noise_floors": v} for n, v in r.steps] for r in self.diagnosis.stages}
-        return {**super().to_dict(), "model": self.path, "waterfall": waterfall}
+        said, words = super().to_dict(), {s.stage: self._word(s) for s in self.diagnosis.stages}
+        rows = cast("list[dict[str, object]]", said["stages"])
+        stages = [{**row, "verdict": words.get(str(row["stage"]), row["verdict"])} for row in rows]
+        own = {"model": self.path, "waterfall": waterfall}
+        return {**said, "verdict": self.verdict, "stages": stages, **own}
 
     def write(self, path: str | Path) -> Path:
         """Write the model file that every command takes with ``--model``; return its path."""
@@ -196,7 +266,7 @@ class Extended(Diagnosed):
         return Path(path)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False, eq=False)
 class Experiment(Answer):
     """Which demand profile would best tell the rivals of a diagnosis apart; ``recommended`` None: there are none."""
 
@@ -208,7 +278,7 @@ class Experiment(Answer):
         """The answer in one sentence."""
         return self.recommended["text"] if self.recommended else "Nothing to separate: the log leaves no rivals."
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """The answer as the JSON of ``vaneloop experiment``."""
         e, notes = self.recommended, self.diagnosed.diagnosis.notes
         if e is None:
@@ -216,10 +286,33 @@ class Experiment(Answer):
         best = {"nats": e["score"], **{k: e[k] for k in ("profile", "repeats", "separates", "text")}}
         return {"schema": 1, "log": self.log, "recommended": best, "profiles": e["table"], "notes": notes}
 
+    def rows(self) -> list[Row]:
+        """A row for each profile that was tried."""
+        table = self.recommended["table"] if self.recommended else []
+        return [{k: v for k, v in row.items() if not isinstance(v, dict)} for row in table]
+
+    def _fits(self) -> list[Fitted]:
+        return self.diagnosed._fits()
+
+    def _worked_out(self) -> Curves:
+        return self.diagnosed._curves
+
+    def plot(self, ax: Axes | None = None, *, signal: str = "", residuals: bool = False) -> Axes:
+        """Draw the demand profile; where none is recommended, or a signal is asked for, as of a diagnosis."""
+        if self.recommended is None or signal or residuals:
+            return super().plot(ax, signal=signal, residuals=residuals)
+        ax = axes(ax)
+        ax.plot(self.recommended["t"], self.recommended["n_dem"], color=COLOUR["target"], label="n_dem")
+        return labelled(ax, heading("n_dem", "%"))
+
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
         d = self.diagnosed
         return experiment_page(d.diagnosis, d.bound, command, self.log, self.sentence(), self.recommended)
+
+
+def _stage(bound: Bound, name: str) -> Stage:
+    return next(s for s in bound.stages if s.name == name)
 
 
 # ---- the verbs -------------------------------------------------------------------------------------------------------
@@ -229,21 +322,21 @@ def _tested_json(rows: Sequence[Tested]) -> dict[str, Any]:
     return {"tested": [asdict(row) for row in rows]} if rows else {}
 
 
-def chain_for(log: Log | str | Path, machine: Machine, fit: Any = (), test: Any = ()) -> tuple[Chain, str]:
+def chain_for(log: LogLike, machine: Machine, fit: Parts = (), test: Parts | AnyLog = ()) -> tuple[Chain, str]:
     """A log in the stages of a machine, and the log's name."""
-    read = log_of(log, machine, require=())
     to_fit, to_test, others = split(fit, test)
     if others:
-        raise InputError(f"test={others[0]!r}: the vane chain takes parts of its log, such as (200, None)")
+        raise InputError(f"test={brief(others[0])}: the vane chain takes parts of its log, such as (200, None)")
+    read = log_of(log, machine, require=())
     return bind_parts(machine, read, to_fit, to_test), read.path
 
 
-def _records(logs: Any, system: System) -> list[Record]:
+def _records(logs: AnyLog, system: System) -> list[Record]:
     several = logs if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
     return [x if isinstance(x, Record) else read_record(x, system)[0] for x in several]
 
 
-def _logs(log: Any, system: System, fit: Any, test: Any, added: Model | None) -> tuple[Logs, str]:
+def _logs(log: AnyLog, system: System, fit: Parts, test: Parts | AnyLog, added: Model | None) -> tuple[Logs, str]:
     """The records held against a system, and the first one's name."""
     to_fit, to_test, others = split(fit, test)
     try:
@@ -256,21 +349,53 @@ def _logs(log: Any, system: System, fit: Any, test: Any, added: Model | None) ->
 
 
 def compare(
-    log: Any,
+    log: AnyLog,
     model: Machine | System | None = None,
     *,
-    fit: Any = (),
-    test: Any = (),
+    fit: Parts = (),
+    test: Parts | AnyLog = (),
     added: Model | None = None,
     progress: Progress | None = None,
 ) -> Stages:
     """By how much does the model miss? Each stage driven by its own logged inputs, so that none hides behind another.
 
-    log    a log of the vane machine (`Log` or a file's name); of a `System`, one or several `Record` or files' names
-    model  what the log is held against; default: the machine of the shipped tables
-    fit    parts of the (first) log that are fitted, (from, to) in s of its own time, None an open end; default: all
-    test   parts of it that only test what was fitted; of a `System` also records
-    added  parameters and laws that a `System` has by now; a `Machine` has its own
+    Parameters
+    ----------
+    log : Log, pandas.DataFrame, str or Path
+        A log of the vane machine. Of a `System` one or several, also as `Record`.
+    model : Machine or System, optional
+        What the log is held against; default: the machine of the shipped tables.
+    fit : (float, float) or a list of such, optional
+        Parts of the (first) log that are fitted, (from, to) in s of its own time, None an open end; default: all.
+    test : (float, float), a list of such, or logs, optional
+        Parts of it that only test what was fitted; of a `System` also logs of their own.
+    added : plant.Model, optional
+        Parameters and laws that a `System` has by now; a `Machine` has its own.
+    progress : callable, optional
+        Takes the fraction done.
+
+    Returns
+    -------
+    Stages
+        Its `rows` are the signals with their errors; ``residuals``, ``fitted`` and ``params`` are those of each stage
+        with its nominal parameters refitted within their tolerances.
+
+    Raises
+    ------
+    InputError
+        One line, for a log that the model cannot be held against.
+
+    Examples
+    --------
+    >>> import vaneloop
+    >>> frame = vaneloop.read_log("examples/hidden_effect.parquet").to_pandas().loc[:30.0, ["x_lvdt", "vigv"]]
+    >>> answer = vaneloop.compare(frame)
+    >>> answer.verdict
+    'agrees'
+    >>> [(row["subsystem"], row["signal"], row["unit"]) for row in answer.rows()]
+    [('linkage', 'vigv', 'deg')]
+    >>> answer.residuals
+    Channels('hidden_effect.parquet', 2,550 rows, 4.51 to 30 s: vigv [deg])
     """
     if isinstance(model, System):
         logs, name = _logs(log, model, fit, test, added)
@@ -287,33 +412,88 @@ def compared(chain: Chain, log: str, verb: str = "compare", progress: Progress |
 
 
 def locate(
-    log: Any,
+    log: AnyLog,
     model: Machine | System | None = None,
     *,
-    fit: Any = (),
-    test: Any = (),
+    fit: Parts = (),
+    test: Parts | AnyLog = (),
     added: Model | None = None,
     progress: Progress | None = None,
 ) -> Stages:
-    """Which stage fails, under which conditions, since when? `compare`, asked for its details."""
+    """Which stage fails, under which conditions, since when? `compare`, asked for its details.
+
+    Parameters
+    ----------
+    log, model, fit, test, added, progress
+        As of `compare`.
+
+    Returns
+    -------
+    Stages
+        Its ``located`` has the conditions of each stage.
+
+    Examples
+    --------
+    >>> import vaneloop
+    >>> frame = vaneloop.read_log("examples/hidden_effect.parquet").to_pandas().loc[:30.0, ["x_lvdt", "vigv"]]
+    >>> print(vaneloop.locate(frame).located[0].verdict())
+    fits everywhere
+    """
     return replace(compare(log, model, fit=fit, test=test, added=added, progress=progress), verb="locate")
 
 
 def diagnose(
-    log: Any,
+    log: AnyLog,
     model: Machine | System | None = None,
     *,
-    fit: Any = (),
-    test: Any = (),
+    fit: Parts = (),
+    test: Parts | AnyLog = (),
     added: Model | None = None,
     without: Sequence[str] = (),
     workers: int = 2,
     progress: Progress | None = None,
 ) -> Diagnosed:
-    """Which physical effects does the model lack? Arguments as of `compare`.
+    """Which physical effects does the model lack?
 
-    without  effects that are not looked for
-    workers  stages searched at a time
+    Parameters
+    ----------
+    log, model, fit, test, added, progress
+        As of `compare`.
+    without : sequence of str, optional
+        Effects that are not looked for.
+    workers : int, optional
+        Stages searched at a time, each in a process of its own; a thread other than the main one searches them one
+        after the other.
+
+    Returns
+    -------
+    Diagnosed
+        Its ``verdict`` is missing, none or unknown; ``effects`` are the names of what is missing, the most probable
+        first; ``params`` has the sizes of these effects.
+
+    Raises
+    ------
+    InputError
+        One line, for a log that the model cannot be held against.
+
+    Examples
+    --------
+    An amplifier that rectifies, and its model that does not:
+
+    >>> import numpy as np, pandas as pd, vaneloop
+    >>> system = vaneloop.System(
+    ...     "amplifier", "static", lambda u, p: p.gain * u.u, inputs={"u": "V"}, outputs={"y": "V"},
+    ...     parameters=[vaneloop.unknown("gain", 1.0, "-")], places=["output"],
+    ... )
+    >>> t = np.arange(0.0, 20.0, 0.02)
+    >>> frame = pd.DataFrame({"u": np.sin(0.4 * t) + 0.7 * np.sin(1.7 * t + 1.0)}, index=pd.Index(t, name="t"))
+    >>> noise = 0.01 * np.random.default_rng(1).standard_normal(len(t))
+    >>> frame["y"] = np.abs(2.0 * frame["u"]) + noise
+    >>> answer = vaneloop.diagnose(frame, system)
+    >>> answer.verdict, answer.effects
+    ('missing', ['y.absolute_value'])
+    >>> round(answer.params["gain"].value, 2), answer.params["gain"].unit
+    (2.0, '-')
     """
     if isinstance(model, System):
         model = replace(model, without=(*model.without, *without))
@@ -360,18 +540,47 @@ def _at_limit(stages: Sequence[StageDiagnosis]) -> list[str]:
 
 
 def extend(
-    log: Any,
+    log: AnyLog,
     effects: Sequence[str],
     model: Machine | System | None = None,
     *,
-    fit: Any = (),
-    test: Any = (),
+    fit: Parts = (),
+    test: Parts | AnyLog = (),
     added: Model | None = None,
 ) -> Extended:
-    """Add effects to the model and fit them, together with those it has. Other arguments as of `compare`.
+    """Add effects to the model and fit them, together with those it has.
 
-    Raises InputError for an effect that is not in the library, or whose stage the log does not show.
+    Parameters
+    ----------
+    log : Log, pandas.DataFrame, str or Path
+        As of `compare`.
+    effects : sequence of str
+        Their names, and law files (``X.toml``).
+    model, fit, test, added
+        As of `compare`.
+
+    Returns
+    -------
+    Extended
+        Its ``verdict`` is explained where the error is noise by now, else missing; ``write`` writes the model.
+
+    Raises
+    ------
+    InputError
+        For an effect that is not in the library, or whose stage the log does not show.
+
+    Examples
+    --------
+    >>> import vaneloop
+    >>> log = vaneloop.read_log("examples/hidden_effect.parquet")[0:60]
+    >>> better = vaneloop.extend(log, ["valve_dead_band", "aero_load"])
+    >>> better.verdict, better.refused
+    ('explained', '')
+    >>> width = better.params["valve_dead_band.half_width"]
+    >>> width.unit, width.low < 0.8 < width.high, width.at_bound
+    ('mA', True, False)
     """
+    effects = [effects] if isinstance(effects, str) else list(effects)
     if isinstance(model, System):
         return _extended(*_logs(log, model, fit, test, added), effects, added)
     machine = model or Machine()
@@ -477,10 +686,31 @@ def with_fits(model: Model, results: Sequence[StageDiagnosis]) -> Model:
     return model.model_copy(update={"parameters": parameters, "effects": effects})
 
 
-def experiment(log: Any, model: Machine | Diagnosed | None = None, *, progress: Progress | None = None) -> Experiment:
+def experiment(
+    log: LogLike, model: Machine | Diagnosed | None = None, *, progress: Progress | None = None
+) -> Experiment:
     """Which demand profile would best tell apart the rivals that a log leaves?
 
-    model  the machine, or the diagnosis of this log where that has been made
+    Parameters
+    ----------
+    log : Log, pandas.DataFrame, str or Path
+        A log of the vane machine.
+    model : Machine or Diagnosed, optional
+        The machine, or the diagnosis of this log where that has been made.
+    progress : callable, optional
+        Takes the fraction done.
+
+    Returns
+    -------
+    Experiment
+        Its ``recommended`` is None where the log leaves no rivals; `rows` are the profiles that were tried.
+
+    Examples
+    --------
+    >>> import vaneloop
+    >>> frame = vaneloop.read_log("examples/hidden_effect.parquet").to_pandas().loc[:30.0, ["x_lvdt", "vigv"]]
+    >>> print(vaneloop.experiment(frame))
+    Nothing to separate: the log leaves no rivals.
     """
     if not isinstance(model, Diagnosed):
         chain, name = chain_for(log, model or Machine())

@@ -33,8 +33,9 @@ from vaneloop.identification.settings import (
 )
 from vaneloop.identification.subsystem import Array, Stage, StageError
 
-__all__ = ["Fit", "LeastSquaresProblem", "Task", "covariance", "finished", "recalibrate"]
+__all__ = ["NINETY", "Fit", "LeastSquaresProblem", "Task", "covariance", "finished", "recalibrate"]
 
+NINETY = 1.645  # standard errors to either side of a value that hold the true one nine times in ten
 Answer = TypeVar("Answer")
 Task = Generator[
     Array, Array, Answer
@@ -410,14 +411,8 @@ class LeastSquaresProblem:
             centre = without.mean(axis=0)
             spread = np.zeros(k)
             spread[move] = (self.n_blocks - 1) / self.n_blocks * np.sum((without - centre) ** 2, axis=0)
-            # a nominal parameter at the edge of its tolerance is still as uncertain as its tolerance
-            loose = move | (scaled_prior > 0.0)
-            excess = max(1.0, cost.sum() / max(self.n, 1))
-            worth = min(1.0 / excess, EVIDENCE * len(self.stage.outputs) / max(self.n, 1))
-            info = normals.sum(axis=0)[np.ix_(loose, loose)] * worth + np.diag(scaled_prior[loose])
-            variance = np.zeros(k)
-            variance[loose] = np.diag(covariance(info))
-            half[move] = (1.645 * np.sqrt(np.maximum(variance, spread)) * scale)[move]
+            variance = np.diag(self._covariance(cost, normals, scaled_prior, move))
+            half[move] = (NINETY * np.sqrt(np.maximum(variance, spread)) * scale)[move]
             turn = np.array([p.period or np.inf for p in self.stage.all_parameters()])[free]
             half = np.minimum(half, 0.5 * turn)
         return Fit(
@@ -432,6 +427,31 @@ class LeastSquaresProblem:
             theta[free] - half,
             theta[free] + half,
         )
+
+    def _covariance(self, cost: Array, normals: Array, scaled_prior: Array, move: Array) -> Array:
+        """Covariance of scaled parameters, as far as the log and what is known beforehand tell them: 0 where neither
+        does. ``move``: which of them are at no bound.
+        """
+        # a nominal parameter at the edge of its tolerance is still as uncertain as its tolerance
+        loose = move | (scaled_prior > 0.0)
+        excess = max(1.0, cost.sum() / max(self.n, 1))
+        worth = min(1.0 / excess, EVIDENCE * len(self.stage.outputs) / max(self.n, 1))
+        out = np.zeros((len(move), len(move)))
+        if loose.any():
+            info = normals.sum(axis=0)[np.ix_(loose, loose)] * worth + np.diag(scaled_prior[loose])
+            out[np.ix_(loose, loose)] = covariance(info)
+        return out
+
+    def correlation(self, fit: Fit) -> Array:
+        """How the errors of a fit's free parameters go together: float64[free, free], from -1 to 1; NaN for one that
+        stands at a bound, or of which nothing is known.
+        """
+        low, high = self.bounds()
+        move = (fit.theta[fit.free] > low[fit.free]) & (fit.theta[fit.free] < high[fit.free])
+        known = self._covariance(fit.cost, fit.normals, fit.prior * self.scale[fit.free] ** 2, move)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            sizes = np.sqrt(np.where(move, np.diag(known), np.nan))
+            return np.asarray(np.clip(known / np.outer(sizes, sizes), -1.0, 1.0))
 
     def _held_out(
         self,

@@ -18,7 +18,7 @@ from vaneloop.base.tables import read
 from vaneloop.identification.candidates import laws
 from vaneloop.identification.candidates.laws import HYSTERETIC
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
-from vaneloop.identification.results import StageDiagnosis, answer_of, at_bound, rms_of
+from vaneloop.identification.results import StageDiagnosis, answer_of, at_bound, interval_of, rms_of
 from vaneloop.identification.selection.diagnosis import Judged
 from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance
 from vaneloop.identification.settings import BOUND_PULL, DRIVES, NO_HELP, STARTS_LOADED
@@ -202,7 +202,7 @@ class ByLog:
         for i, p in enumerate(self.logs.fitted.stage.parameters):
             where = np.flatnonzero(fit.free == i)
             value = float(fit.theta[i])
-            low, high = (float(fit.low[where[0]]), float(fit.high[where[0]])) if len(where) else (value, value)
+            low, high = interval_of(p, fit, int(where[0])) if len(where) else (value, value)
             out.append({"parameter": p.name, "value": value, "low": low, "high": high, "unit": p.unit})
         return out
 
