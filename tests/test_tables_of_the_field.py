@@ -328,7 +328,8 @@ def test_a_proposed_unit_of_time_is_the_right_one(
 
 
 UNITS_THAT_ARE_TOLD = [
-    ("p_s", 210.0, "bar"), ("p_s", 21e6, "Pa"), ("p_s", 3046.0, "psi"), ("t_oil", 313.0, "K"), ("x_lvdt", 24_000.0, "um"),
+    ("p_s", 210.0, "bar"), ("p_s", 21e6, "Pa"), ("p_s", 3046.0, "psi"), ("t_oil", 313.0, "K"),
+    ("x_lvdt", 24_000.0, "um"),
 ]  # fmt: skip
 
 

@@ -201,6 +201,15 @@ OURS = (
         recording="hil.logs.recordings:read_text",
     ),
     Format(
+        "Megasquirt log", (".msl",), "as written by TunerStudio and MegaLogViewer: a CSV with tabs",
+        names="columns", source="hil.logs.csv_format:open_csv", channels="hil.logs.csv_format:write_msl",
+    ),
+    Format(
+        "LabVIEW measurement", (".lvm",), "one time for all channels or one for each, or none but the step",
+        names="columns", begins=(b"LabVIEW Measurement",),
+        source="hil.logs.csv_format:open_csv", channels="hil.logs.csv_format:write_lvm",
+    ),
+    Format(
         "frames in CSV", (".csv",), "a row a frame, as SavvyCAN and GVRET, CANedge or python-can write it; told by the "
         "header",
         names=_SIGNALS,

@@ -21,8 +21,7 @@ from hil.logs.units import NO_UNIT, factor_of, scale_of
 from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES
 
-__all__ = ["ENOUGH", "Files", "Guess", "Guesses", "contradictions", "design_speed", "guess", "mean_stroke",
-           "withdrawn"]
+__all__ = ["ENOUGH", "Files", "Guess", "Guesses", "contradictions", "design_speed", "guess", "mean_stroke", "withdrawn"]
 
 ENOUGH = 0.7  # confidence below which a name is only mentioned
 ALIKE = 0.1  # two candidates whose confidences differ by no more are not told apart

@@ -20,13 +20,13 @@ import numpy as np
 from hil.logs import plausible
 from hil.logs.channels import Channels
 from hil.logs.dataframe import frame_columns, is_frame, name_of, open_frame
-from hil.logs.formats import format_of
+from hil.logs.formats import format_at
 from hil.logs.guess import Files, Guess
 from hil.logs.opening import Opened, is_ours, open_log, sketch, wanted_design_speed
 from hil.logs.scale import proposed_scale
 from hil.logs.source import ABSENT, Channel, LogError, Options, Series, Source, close_names, find, is_absent
 from hil.logs.table import NoTime, split_unit
-from hil.logs.units import Units
+from hil.logs.units import UnitError, Units
 from vaneloop.base.errors import meant
 from vaneloop.base.signals import UNITS
 
@@ -82,7 +82,8 @@ class Log(Channels):
         _refuse_units(self.path, wrong)
         times = [c.t for c in self.channels.values() if c.t.size]
         if times and (why := plausible.span_complaint(times)):
-            raise LogError(f"{self.path}: {why}; --unit t=ms, if time counts in ms")
+            unit = plausible.unit_of_time(max(times, key=len))
+            raise LogError(f"{self.path}: {why}; --unit t={unit}, if time counts in {unit}")
         own = {name: c if c.unit else replace(c, unit=self.signals.get(name, "")) for name, c in self.channels.items()}
         object.__setattr__(self, "channels", own)
 
@@ -270,6 +271,7 @@ def read_log(
     guess: bool = True,
     mapping_file: str | Path | None = None,
     tables: Files | None = None,
+    part: int = 0,
     name: str = "",
 ) -> Log:
     """Read a log of any format, or a ``pandas.DataFrame``, into channels with the product's names and units.
@@ -298,6 +300,8 @@ def read_log(
     tables : Mapping, optional
         The machine's own tables, against whose schedule guesses are held: name without suffix -> file; default: the
         shipped ones.
+    part : int, optional
+        Which run of a table in which the header stands again, from 1; 0: all where time goes on, else the longest.
     name : str, optional
         What messages call a frame; default: its ``attrs["name"]``.
 
@@ -333,7 +337,7 @@ def read_log(
     if design_rpm is not None and not (math.isfinite(design_rpm) and design_rpm > 0):
         raise LogError(f"{path}: design speed (={design_rpm:g} rpm) must be finite and above 0")
 
-    log = open_log(path, dbc, mapping, units, design_rpm, signals, guess, mapping_file, tables or {}, opened)
+    log = open_log(path, dbc, mapping, units, design_rpm, signals, guess, mapping_file, tables or {}, part, opened)
     source, named, notes, units = log.source, log.named, log.notes, log.units
     if log.guesses.rpm:
         speed, _, words = wanted_design_speed(path, log)
@@ -499,7 +503,7 @@ def write_log(path: str | Path, channels: dict[str, Channel], *, dbc: str | Path
     LogError for a name that is no signal, a channel that is not one, a value that its frame cannot hold.
     """
     path = Path(path)
-    of = format_of(path)
+    of = format_at(path)
     if not channels:
         raise LogError(f"{path}: no channel to write")
     checked = {}

@@ -103,11 +103,12 @@ def open_log(
     guess: bool,
     mapping_file: str | Path | None,
     tables: Files,
+    part: int = 0,
     opened: Callable[[Path, Options], Source] | None = None,
 ) -> Opened:
     """Open a log and find its names, guessed where nobody states them; arguments as of `read_log`.
 
-    opened  what opens it; default: its format, by its suffix
+    opened  what opens it; default: its format
     """
     bench = read_mapping(mapping_file, signals) if mapping_file is not None else Bench()
     guess = guess and mapping_file is None  # a mapping file says it all
@@ -116,8 +117,11 @@ def open_log(
     _known_units(path, units or {}, signals)
     given = _pairs(path, mapping, signals)
     named = {**bench.names, **given}
-    options = Options(Path(dbc) if dbc is not None else None, {name: signal for signal, name in named.items()}, guess)
-    source = (opened or format_of(path).open)(path, options)
+    by_name = {name: signal for signal, name in named.items()}
+    options = Options(Path(dbc) if dbc is not None else None, by_name, guess, part)
+    source = (opened or format_at(path).open)(path, options)
+    if part and not isinstance(source, Table):
+        raise LogError(f"{path}: part {part}: only tables have parts")
     absent = {s: n for s, n in bench.names.items() if s not in given and s != "t" and not find(source, n, True)}
     for signal in absent:
         del named[signal]

@@ -25,6 +25,7 @@ library does not suffice the answer is "unknown", with the shape of the remainin
 
 examples:
   vaneloop diagnose examples/hidden_effect.parquet --report diagnosis.html
+  vaneloop diagnose examples/hidden_effect.parquet --explain
   vaneloop extend examples/hidden_effect.parquet --effect valve_dead_band --out with_dead_band.toml
   vaneloop diagnose examples/hidden_effect.parquet --model with_dead_band.toml --json -
 

@@ -16,7 +16,7 @@ from vaneloop.base.compiled import compiled
 from vaneloop.identification.least_squares.noise import colour_of, tolerance
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
 from vaneloop.identification.results import rms_per_output
-from vaneloop.identification.settings import AGREES, CORRELATION, NOISE_KNOWN_TO, REGIME_BINS, REGIME_LEVEL, SHAPE_TOLD
+from vaneloop.identification.settings import AGREES, COLOUR, NOISE_KNOWN_TO, REGIME_BINS, REGIME_LEVEL, SHAPE_TOLD
 from vaneloop.identification.subsystem import Array, without_jumps
 
 __all__ = [

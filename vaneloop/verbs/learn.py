@@ -69,6 +69,7 @@ class Learned(Answer):
     model      the model with them, to be written; None: none was learned
     steps      channel -> step (border unit) in which its reading comes, where its converter's low bits are lost
     fits       of each stage that a law was learned in: the model with its laws
+    decisions  subsystem -> what the acceptance rules said of each candidate
     """
 
     diagnosed: Diagnosed
@@ -80,6 +81,7 @@ class Learned(Answer):
     path: str = ""
     steps: Mapping[str, float] = field(default_factory=dict)
     fits: tuple[Fitted, ...] = ()
+    decisions: Mapping[str, Sequence[Decision]] = field(default_factory=dict)
 
     @property
     def verdict(self) -> str:
@@ -295,6 +297,7 @@ def learned(
     open_ones = [s for s in stages if _open(chain, s)]
     laws: list[LearnedLaw] = []
     model, said, out, fits = before, [], None, list[Fitted]()
+    decisions: dict[str, list[Decision]] = {}
     for i, d in enumerate(open_ones):
         stage = chain.stage(d.stage)
         if stage.coarse:  # what it would learn is how the steps look from there
@@ -341,7 +344,10 @@ def learned(
         model = with_fits(model, [s for s in stages if s.verdict == "missing"])
     outcome = Outcome(verdict, nearest=out.nearest if out else [], why=why, notes=said if laws else [])
     tell(1.0)
-    return Learned(found, outcome, laws, None, model if laws else None, log, steps=chain.steps, fits=tuple(fits))
+    return Learned(
+        found, outcome, laws, None, model if laws else None, log, steps=chain.steps, fits=tuple(fits),
+        decisions=decisions,
+    )  # fmt: skip
 
 
 def nominal_of(last: FittedCandidate) -> Fit:
@@ -410,7 +416,10 @@ def _learned(
     by_log = ByLog.of(on_logs(logs, last.curves), d, added)
     model = _as_model(by_log.model, outcome, laws, last)
     progress(1.0)
-    return Learned(diagnosed, outcome, laws, by_log, model, diagnosed.log, fits=(Fitted(judge, last.fit, base),))
+    return Learned(
+        diagnosed, outcome, laws, by_log, model, diagnosed.log, fits=(Fitted(judge, last.fit, base),),
+        decisions=decisions,
+    )  # fmt: skip
 
 
 def _beside_named(
