@@ -21,6 +21,7 @@ from tests import rig
 from tests.firmware_on_rig import firmware
 from vaneloop.base.errors import InputError
 from vaneloop.cli.main import main
+from vaneloop.identification.selection.rules import SUITS_ALL, LogChanges
 from vaneloop.identification.vane_chain.candidates import VaneChainCandidates, remade, reversals
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
 from vaneloop.verbs.learn import learned
@@ -294,3 +295,23 @@ def test_pieces_of_a_log_whose_stroke_hardly_moves_count_as_the_log_does() -> No
     part = stage.excerpt(np.arange(3000, 5000))
     assert np.isfinite(stage.measured[:, 3000:4990]).all()
     assert np.isfinite(part.measured[:, :1990]).all()
+
+
+def test_a_curve_at_a_shared_place_is_held_against_the_other_subsystem() -> None:
+    """What the linkage would put down to the LVDT moves the stroke that the actuator explains; what is at the ring does
+    not.
+    """
+    stages = chain()[1].stages
+    linkage = next(s for s in stages if s.name == "linkage")
+    ground = VaneChainCandidates(linkage, others=[s for s in stages if s is not linkage])
+    own = linkage.neutral()[: len(linkage.parameters)]
+    found = {c.name: c for c in ground.candidates(own)}
+    lvdt, ring = found["sensors.lvdt.curve_of_time"], found["linkage.ring.curve_of_x_lvdt"]
+    for c, size, worse in ((lvdt, c_size := lvdt.size, True), (lvdt, 0.0, False), (ring, c_size, False)):
+        curves = ((c.placed(), c.effect(1.0)),)
+        theta = np.concatenate([own, np.full(len(curves[0][1].parameters), size)])
+        assert ground.elsewhere(curves, theta).keys() == ({"the actuator subsystem"} if worse else set())
+    steep = np.concatenate([own, np.full(len(lvdt.effect(1.0).parameters), 20.0 * lvdt.size)])
+    change = ground.elsewhere(((lvdt.placed(), lvdt.effect(1.0)),), steep)
+    case = LogChanges(change, frozenset(change))
+    assert not SUITS_ALL.verdict(case).holds and case.objection().startswith("makes the actuator subsystem worse")

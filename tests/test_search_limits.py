@@ -113,8 +113,8 @@ def test_an_effect_must_explain_a_seventh_of_the_excess(times: float, beyond: bo
 
 
 @SIDES
-@pytest.mark.parametrize(("blocks", "each", "edge"), [(20, 100_000, 0.01), (20, 100, 3.0 * np.sqrt(1.5 / 2000.0))])
-def test_a_search_begins_one_per_cent_or_three_deviations_of_error_and_floor_above_it(
+@pytest.mark.parametrize(("blocks", "each", "edge"), [(20, 100_000, 0.01), (20, 100, 3.0 / np.sqrt(4000.0))])
+def test_a_search_begins_one_per_cent_or_three_deviations_above_the_floor(
     blocks: int, each: int, edge: float, times: float, beyond: bool
 ) -> None:
     judge = judge_of(blocks, each)
@@ -125,7 +125,7 @@ def test_a_search_begins_one_per_cent_or_three_deviations_of_error_and_floor_abo
 def test_a_search_begins_where_one_block_stands_eight_spreads_above_the_floor(times: float, beyond: bool) -> None:
     judge = judge_of(2000, 100)
     errors = np.ones(2000)
-    errors[3] += 0.01 + 8.0 * times * np.sqrt(1.0 / 200.0 + 1.0 / 200_000.0)
+    errors[3] += 0.01 + 8.0 * times / np.sqrt(200.0)
     assert noise_floor._above_floor(judge, fit_of(errors, judge), 1.0) == beyond
 
 

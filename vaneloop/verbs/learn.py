@@ -306,7 +306,7 @@ def learned(
             said.append(f"{d.stage}: {'; '.join(stage.coarse.values()) if explains else driven}")
             continue
         test = next((s for s in chain.test.stages if s.name == d.stage), None) if chain.test else None
-        ground = VaneChainCandidates(stage, d.floor, test)
+        ground = VaneChainCandidates(stage, d.floor, test, [s for s in chain.stages if s is not stage])
         said_by = lambda f, i=i: tell(begun + (1.0 - begun) * (i + f) / len(open_ones))  # noqa: E731
         learner = CurveSearch(ground, d, said_by, shape, formulas)
         one = learner.learned()

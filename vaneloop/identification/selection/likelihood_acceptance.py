@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vaneloop.identification.least_squares.noise import correlation_of, floor_deviation
+from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import (
     Candidate,
@@ -63,16 +63,16 @@ BOUND = "fits only at the end of its physical range"
 
 
 def _above_floor(judge: LeastSquaresProblem, fit: Fit, correlation: float, known: float = FLOOR_KNOWN) -> bool:
-    """True when the held-out error is above the noise floor, over the whole log or in single blocks, by more than the
-    floor's spread.
+    """True when the held-out error is above the noise floor, over the whole log or in single blocks, by more than its
+    own scatter. A search then begins: the acceptance rules do not rest on the floor's level, so that its own
+    uncertainty is no matter here.
 
     known  relative error of the noise floor
     """
     n, m = max(judge.n, 1), np.maximum(judge.samples, 1)
-    spread = SPREADS * floor_deviation(n, n, correlation)
-    whole = np.sqrt(max(fit.held_out.sum(), 0.0) / n) > 1.0 + max(float(spread), known)
+    whole = np.sqrt(max(fit.held_out.sum(), 0.0) / n) > 1.0 + max(SPREADS * np.sqrt(correlation / (2.0 * n)), known)
     errors = np.sqrt(np.maximum(fit.held_out, 0.0) / m / judge.expected())
-    blocks = errors > 1.0 + known + BLOCK_SPREADS * floor_deviation(m, n, correlation)
+    blocks = errors > 1.0 + known + BLOCK_SPREADS * np.sqrt(correlation / (2.0 * m))
     return bool(whole or np.any(blocks & (m > 0.2 * m.max())))
 
 

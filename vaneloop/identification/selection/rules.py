@@ -12,6 +12,7 @@ A number that is not finite never meets a limit.
 | `NEAR_NOISE` | curves where the error is hardly more than noise | `AllRows` |
 | `DISSIPATES`, `CONFIRMED` | curves of hysteretic and dynamic terms | a number, `Confirmation` |
 | `OTHER_LOGS` | what was accepted, on each log | `LogChanges` |
+| `SUITS_ALL` | curves, on the other subsystems in which they act | `LogChanges` |
 | `NAMED` | each effect before it is named | `Naming` |
 | `EXPLAINS_HALF`, `LEAVES_LITTLE` | the whole set, where the noise is known | `Remainder` |
 | `LEAVES_A_QUARTER` | the whole set, where it is not | `Remainder` |
@@ -53,9 +54,9 @@ from vaneloop.identification.subsystem import Array
 
 __all__ = [
     "AWAY", "CONFIRMED", "DISSIPATES", "EXCESS", "EXPLAINS_HALF", "GAIN", "HARMS_NONE", "KNOWN_NOISE",
-    "LEAVES_A_QUARTER", "LEAVES_LITTLE", "NAMED", "NEAR_NOISE", "OTHER_LOGS", "RULES", "UNKNOWN_NOISE", "AllRows",
-    "Comparison", "Confirmation", "Decision", "Decisions", "LogChanges", "Naming", "Remainder", "Rule", "Verdict",
-    "decisions_json", "gain",
+    "LEAVES_A_QUARTER", "LEAVES_LITTLE", "NAMED", "NEAR_NOISE", "OTHER_LOGS", "RULES", "SUITS_ALL", "UNKNOWN_NOISE",
+    "AllRows", "Comparison", "Confirmation", "Decision", "Decisions", "LogChanges", "Naming", "Remainder", "Rule",
+    "Verdict", "decisions_json", "gain",
 ]  # fmt: skip
 
 Case = TypeVar("Case")
@@ -414,6 +415,12 @@ IS_OF_USE = Rule[LogChanges](
     applies=lambda c: bool(c.change),
 )  # fmt: skip
 OTHER_LOGS = (HARMS_NONE, IS_OF_USE)
+SUITS_ALL = Rule[LogChanges](
+    "other subsystems", "log error",
+    "What acts in several subsystems must suit all of them.",
+    lambda c: c.change[c.worst] if c.worst is not None else -np.inf, lambda _: HARM, at_most=True,
+    applies=lambda c: c.worst is not None,
+)  # fmt: skip
 
 
 # ---- names, and what the whole set leaves ----------------------------------------------------------------------------
@@ -508,8 +515,8 @@ LEAVES_A_QUARTER = Rule[Remainder](
 RULES: dict[str, Rule[Any]] = {
     rule.name: rule
     for rule in (
-        *KNOWN_NOISE, *UNKNOWN_NOISE, AWAY, *NEAR_NOISE, DISSIPATES, CONFIRMED, *OTHER_LOGS, *NAMED, EXPLAINS_HALF,
-        *LEAVES_LITTLE, LEAVES_A_QUARTER,
+        *KNOWN_NOISE, *UNKNOWN_NOISE, AWAY, *NEAR_NOISE, DISSIPATES, CONFIRMED, *OTHER_LOGS, SUITS_ALL, *NAMED,
+        EXPLAINS_HALF, *LEAVES_LITTLE, LEAVES_A_QUARTER,
     )
 }  # fmt: skip
 

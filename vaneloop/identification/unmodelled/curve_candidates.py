@@ -413,6 +413,10 @@ class UserModelCandidates:
         """Error of every sample of each output in noise floors, log by log, test logs too."""
         return {log: e / self.floor[:, None] for log, e in on_logs(self.logs, curves, laws).errors(theta).items()}
 
+    def elsewhere(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> dict[str, float]:
+        """Nothing: the model is one subsystem."""
+        return {}
+
     def within(self, candidate: Candidate) -> dict[str, Array]:
         """Of test logs, the samples where a candidate's quantity is where its curve was learned."""
         test = self.logs.test

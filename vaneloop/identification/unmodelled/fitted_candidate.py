@@ -82,6 +82,11 @@ class CandidateSource(Protocol):
     def errors(self, curves: Placings, theta: Array, laws: Sequence[str] = ()) -> dict[str, Array]:
         """Error of every sample of each output in noise floors, log by log, test logs too; NaN where none is known."""
 
+    def elsewhere(self, curves: Placings, theta: Array) -> dict[str, float]:
+        """Of each other subsystem in which curves act, with the parameters at the end of ``theta``, the log of its
+        error with them over that without.
+        """
+
     def within(self, candidate: Candidate) -> dict[str, Array]:
         """Of test logs, the samples where a candidate's quantity is where its curve was learned: bool[samples]."""
 

@@ -18,6 +18,7 @@ from vaneloop.identification.selection.rules import (
     GAIN,
     NEAR_NOISE,
     OTHER_LOGS,
+    SUITS_ALL,
     UNKNOWN_NOISE,
     AllRows,
     Comparison,
@@ -157,14 +158,18 @@ class CurveProblem:
         return FittedCandidate(candidate, wiggle, judge, fit, curves)
 
     def objection(self, before: FittedCandidate, tried: FittedCandidate) -> str:
-        """Why the logs speak against a curve; "": they do not."""
+        """Why the logs, or other subsystems in which it acts, speak against a curve; "": they do not."""
         logs = LogChanges(self.change(before, tried), self.ground.tests)
         sure = True
         if self.faint:
             rows = AllRows(before.errors or {}, tried.errors or {}, self.ground.tests)
             sure = self.decisions.decide(NEAR_NOISE, rows, tried.names, before.names)
         harmless = self.decisions.decide(OTHER_LOGS, logs, tried.names, before.names)
-        return rows.objection() if not sure else "" if harmless else logs.objection()
+        if not sure or not harmless:
+            return logs.objection() if sure else rows.objection()
+        change = self.ground.elsewhere(tried.curves, tried.fit.theta)
+        elsewhere = LogChanges(change, frozenset(change))
+        return "" if self.decisions.decide([SUITS_ALL], elsewhere, tried.names, before.names) else elsewhere.objection()
 
     def change(
         self, before: FittedCandidate, tried: FittedCandidate, part: Mapping[str, Array] | None = None

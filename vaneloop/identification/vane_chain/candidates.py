@@ -162,6 +162,7 @@ class VaneChainCandidates:
     stage  with all laws that it can have
     floor  noise of its outputs; None: its own
     test   the same stage on a part of the log that nothing is fitted to
+    others the other stages of the log, where a curve at a shared place acts, too
     """
 
     points, jumps = POINTS, False  # as the plant's rows have them
@@ -169,8 +170,12 @@ class VaneChainCandidates:
     shares = True
     surfaces = False  # a curve is rows of the plant's parameters, of one signal
 
-    def __init__(self, stage: Stage, floor: Array | None = None, test: Stage | None = None):
+    def __init__(
+        self, stage: Stage, floor: Array | None = None, test: Stage | None = None, others: Sequence[Stage] = ()
+    ):  # fmt: skip
         assert isinstance(stage.made, Made) and stage.floor is not None
+        self.others = [s for s in others if isinstance(s.made, Made) and s.floor is not None and not s.coarse]
+        self.left: dict[str, float] = {}  # error of each of these without any curve, in noise floors
         self.driven, self.all, self.test = stage.made.driven, stage, test
         self.floor = stage.floor if floor is None else floor
         self.tests: frozenset[str] = frozenset()
@@ -214,6 +219,31 @@ class VaneChainCandidates:
                 continue
             judge = LeastSquaresProblem(remade(stage, laws, curves), self.floor, part)
             out[name] = np.where(judge.valid, judge.errors(theta[None])[0], np.nan)
+        return out
+
+    def elsewhere(self, curves: Sequence[tuple[Placed, Effect]], theta: Array) -> dict[str, float]:
+        """Of each other subsystem in which curves act, with the parameters at the end of ``theta``, the log of its
+        error with them over that without, both at least the noise: its nominal parameters refitted, the curves as
+        they are.
+        """
+        out = {}
+        many = sum(len(effect.parameters) for _, effect in curves)
+        quantities = [placed.curve.quantity for placed, _ in curves if placed.curve is not None]
+        for stage in self.others:
+            assert isinstance(stage.made, Made) and stage.floor is not None
+            if any(stage.made.driven.quantity(q) is None for q in quantities):
+                continue
+            other = remade(stage, (), curves)
+            without = other.neutral()
+            with_them = np.concatenate([without[: len(without) - many], theta[len(theta) - many :]])
+            still, moved = other.run(np.array([without, with_them]))
+            if np.array_equal(still, moved, equal_nan=True):
+                continue
+            judge = LeastSquaresProblem(other, stage.floor)
+            if stage.name not in self.left:
+                self.left[stage.name] = rms_of(judge, judge.fit((), without, 4))
+            now = rms_of(judge, judge.fit((), with_them, 4))
+            out[f"the {stage.name} subsystem"] = float(np.log(max(now, 1.0) / max(self.left[stage.name], 1.0)))
         return out
 
     def within(self, candidate: Candidate) -> dict[str, Array]:
