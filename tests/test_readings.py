@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from hil.logs import Channel, Log
+from plant import Model
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import StageDiagnosis, rms_per_output
 from vaneloop.identification.selection.diagnosis import diagnose_stage
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
+from vaneloop.verbs.search import extended
 
 
 def recorded(hidden: list[Hidden], seed: int, rate: int, duration: float = 120.0) -> dict[str, np.ndarray]:
@@ -150,3 +152,13 @@ def test_a_stroke_far_behind_is_smoothed_no_rounder_than_it_was() -> None:
     fit = judge.fit(("lvdt_lag",), start, 8)
     assert fit.theta[lag] == pytest.approx(0.0267, rel=0.02)
     assert np.all(rms_per_output(judge, fit) < 1.03 * stage.floor)
+
+
+def test_extend_fits_an_effect_where_the_log_shows_it_most_clearly() -> None:
+    """To the actuator a wrong gain of the LVDT is a wrong flow gain, which is known within its tolerance only."""
+    chain = chain_of(recorded([Hidden("lvdt_gain", {"factor": 0.9845})], 7, 100, 100.0))
+    answer = extended(chain, ["lvdt_gain"], Model(), "log")
+    (stage,) = answer.diagnosis.stages
+    assert stage.stage == "linkage" and not answer.refused
+    assert answer.model is not None and answer.model.effects["lvdt_gain"]["factor"] == pytest.approx(0.9845, abs=5e-4)
+    assert stage.steps[0][1] > 3.0 and stage.excess < 1.05

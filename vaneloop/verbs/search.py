@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import difflib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
 
 from plant import write_model
 from plant.curve import PLACES
@@ -622,41 +624,48 @@ def known(effects: Sequence[str], option: str = "effect") -> None:
 def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Extended:
     """`extend` of a log that has been put into the stages of the nominal machine; ``before``: the model so far."""
     started = time.perf_counter()
-    by_stage: dict[str, list[str]] = {}
-    curves: dict[str, list[Any]] = {}
     laws = {name: law.now(before.effects.get(name, {})) for name, law in before.curves.items()}
-
-    def seen_in(places: Sequence[str]) -> str | None:
-        """The first of these stages that the log shows."""
-        return next((s for s in places if any(s == c.name for c in chain.stages)), None)
-
+    places: dict[str, list[str]] = {}  # effect -> the subsystems of this log that show it
     for name in dict.fromkeys([*before.effects, *wanted]):
-        if law := laws.get(name):
-            shown = PLACES[f"{law.at} {law.how}"].stages
-            where = seen_in(shown)
-            if where is None:
-                why = chain.not_observed.get(shown[0], "not observed")
-                raise InputError(f"{log}: --effect {name}: the log does not show its subsystem ({shown[0]}: {why})")
-            by_stage.setdefault(where, []).append(name)
-            curves.setdefault(where, []).append(curve_effect(name, law))
-            continue
-        if (kind := chain.plant.kind) not in EFFECTS[name].kinds:
+        law = laws.get(name)
+        if law is None and (kind := chain.plant.kind) not in EFFECTS[name].kinds:
             raise InputError(f"--effect {name}: not of an actuator of kind {kind} (docs/effects.md)")
-        stage = seen_in(EFFECTS[name].stages)
-        if stage is not None:
-            by_stage.setdefault(stage, []).append(name)
-        elif name in wanted:
-            why = "; ".join(f"{s}: {chain.not_observed.get(s, 'not observed')}" for s in EFFECTS[name].stages)
+        shown = PLACES[f"{law.at} {law.how}"].stages if law else EFFECTS[name].stages
+        places[name] = [s for s in shown if any(s == c.name for c in chain.stages)]
+        if not places[name] and (law or name in wanted):
+            why = "; ".join(f"{s}: {chain.not_observed.get(s, 'not observed')}" for s in shown)
             raise InputError(f"{log}: --effect {name}: the log does not show its subsystem ({why})")
 
-    def with_curves(stages: Chain) -> Chain:
+    def fitted_in(stages: Chain, by_stage: Mapping[str, Sequence[str]]) -> Chain:
         """The stages as they are fitted: those with a learned law have its curve."""
-        parts = {s: [n for n in names if n not in laws] for s, names in by_stage.items()}
-        return replace(
-            stages, stages=[with_laws(x, parts.get(x.name, ()), curves.get(x.name, ()), log) for x in stages.stages]
-        )
+        out = []
+        for x in stages.stages:
+            names = by_stage.get(x.name, ())
+            curves = [curve_effect(n, laws[n]) for n in names if n in laws]
+            out.append(with_laws(x, [n for n in names if n not in laws], curves, log))
+        return replace(stages, stages=out)
 
-    bound = changed(chain, with_curves)
+    def clearest(name: str, sure: Mapping[str, Sequence[str]]) -> str:
+        """The subsystem that shows an effect most clearly beside those that are ``sure`` to be there: the greatest gain
+        of log-likelihood, its noise taken as what is left.
+        """
+        gains = {}
+        for s in places[name]:
+            names = (*sure.get(s, ()), name)
+            stage = fitted_in(chain, {s: names}).stage(s)
+            (found,) = (f for f in extend_stage(stage, names).effects if f.effect == name)
+            gains[s] = float(np.isfinite(stage.measured).sum()) * np.log(max(found.fall, 1e-300))
+        return max(gains, key=lambda s: gains[s])
+
+    by_stage: dict[str, list[str]] = {}
+    for name in sorted(filter(places.get, places), key=lambda n: len(places[n]) > 1):
+        where = places[name][0] if len(places[name]) == 1 else clearest(name, by_stage)
+        by_stage.setdefault(where, []).append(name)
+    order = list(places)
+    for names in by_stage.values():
+        names.sort(key=order.index)
+
+    bound = changed(chain, lambda stages: fitted_in(stages, by_stage))
     results = [as_compared(chain.stage(s), extend_stage(bound.stage(s), tuple(names))) for s, names in by_stage.items()]
     model = with_fits(before, results)
     seconds = time.perf_counter() - started
