@@ -1163,7 +1163,7 @@ def extending(monkeypatch: pytest.MonkeyPatch) -> Any:
     asked: list[Any] = []
     monkeypatch.setattr(search, "extend_stage", lambda stage, names, **how: SimpleNamespace(
         stage=stage.name, recalibrated=[], names=names, on=stage, effects=[
-            SimpleNamespace(effect=n, parameters={"scale": {"value": 1.0}}, fall=1.1 if stage.name == "actuator" else 2.0)
+            SimpleNamespace(effect=n, parameters={"scale": {"value": 1.0}}, fall=1.0 + (stage.name == "linkage"))
             for n in names
         ]))  # fmt: skip
     monkeypatch.setattr(search, "as_compared", lambda stage, answer: answer)
