@@ -185,7 +185,7 @@ BROKEN = {
     "other suffix": ("from hil.logs import Format\nRIG = Format('a', ('.gir',))", ".rig = rig_logs:RIG",
                      "whose suffixes are .gir"),
     "no part": ("from hil.logs import Format\nRIG = Format('a rig', ('.rig',))", ".rig = rig_logs:RIG",
-                "a rig cannot be read; allowed: .mf4, .csv, .msl, .lvm, .parquet"),
+                "a rig cannot be read; allowed: .mf4, .dat, .mdf, .csv, .msl, .lvm, .parquet"),
     "no source": ("from hil.logs import Format\nRIG = Format('a', ('.rig',), source=lambda path, options: 3)",
                   ".rig = rig_logs:RIG", "which opens it as int: that is no Source, it has no kind"),
     "opens badly": ("from hil.logs import Format\nRIG = Format('a', ('.rig',), source=lambda path, options: 1 / 0)",

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hil.logs import plausible
-from hil.logs.guess import Guess, _mean_stroke, contradictions, design_speed, guess
+from hil.logs.guess import Guess, contradictions, design_speed, guess, mean_stroke
 from hil.logs.names import CERTAIN, bracketed, is_time, lacks, meaning, spool, unit_behind, unit_in_name, unit_kind
 from hil.logs.plausible import RANGES, judge, latest, longest_part, out_of_order, proposed, span_complaint, too_small
 from hil.logs.source import LogError, Series
@@ -575,15 +575,15 @@ def test_a_current_that_drives_the_stroke_backwards_is_turned() -> None:
     assert clash("i_cmd", i_cmd=-drive, x_lvdt=stroke * 2.1 / rate) != {}
 
 
-def mean_stroke(speed: np.ndarray) -> np.ndarray:
+def by_schedule(speed: np.ndarray) -> np.ndarray:
     """The shipped controller's mean curve: mm."""
-    return np.interp(speed, *_mean_stroke({}))
+    return np.interp(speed, *mean_stroke({}))
 
 
 def test_a_stroke_far_from_the_schedule_has_another_zero_or_unit() -> None:
     speed = 60.0 + 40.0 * np.sin(2 * np.pi * T / 10.0)
-    planned = mean_stroke(speed)
-    reach = float(np.ptp(mean_stroke(np.linspace(0.0, 120.0, 1001))))
+    planned = by_schedule(speed)
+    reach = float(np.ptp(by_schedule(np.linspace(0.0, 120.0, 1001))))
     assert reach == pytest.approx(44.0, abs=0.5)
     assert clash("x_dem", n_r=speed, x_dem=planned) == {}
     assert clash("x_dem", n_r=speed, x_dem=planned + 0.179 * reach) == {}
@@ -620,7 +620,7 @@ def test_a_vane_that_follows_another_stage_s_schedule_is_told() -> None:
 @pytest.mark.parametrize(("scale", "rpm"), [(10_000.0, 10_000.0), (12_500.0, 12_500.0), (9_460.0, 9_460.0)])
 def test_the_design_speed_is_that_under_which_the_stroke_follows_the_schedule(scale: float, rpm: float) -> None:
     speed = 60.0 + 35.0 * np.sin(2 * np.pi * T / 10.0)
-    found, why = design_speed((T, speed * scale / 100.0), (T, mean_stroke(speed)))
+    found, why = design_speed((T, speed * scale / 100.0), (T, by_schedule(speed)))
     assert found == pytest.approx(rpm, rel=0.01)
     assert why.startswith("the stroke follows the schedule best with ") and why.endswith(" rpm")
     top, because = design_speed((T, speed * scale / 100.0), None)

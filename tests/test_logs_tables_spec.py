@@ -535,10 +535,11 @@ def test_a_channel_is_brought_to_its_own_unit_with_its_sign() -> None:
     for arguments, said in (
         (
             ("x_dem", "bar"),
-            "LOG: x_dem (key) in 'bar': unit does not convert; allowed: mm or what converts to it (--unit x_dem=...)",
+            "LOG: x_dem (key) in 'bar': unit does not convert; allowed: mm or what converts to it (--unit x_dem=..., "
+            "with gain and zero --unit 'x_dem=2.5*mm-10')",
         ),
         (("x_dem", "", "quux"), "LOG: x_dem (key) in 'quux': unit is not known; allowed: mm or what converts to it"),
-        (("n_r", "mm"), "unit does not convert; allowed: %, or rpm, Hz, rad/s with the design speed (--unit n_r=...)"),
+        (("n_r", "mm"), "unit does not convert; allowed: %, or rpm, Hz, rad/s with the design speed (--unit n_r=..."),
         (
             ("n_r", "rpm"),
             "LOG: n_r (key) is in rpm and needs the design speed to become %; --design-rpm R gives the design speed",
@@ -708,7 +709,7 @@ def test_a_suffix_that_is_no_log_s_is_refused(tmp_path: Path) -> None:
     for act in (read, lambda p: write_log(p, {"n_dem": Channel(np.zeros(1), np.zeros(1))}), offered):
         with pytest.raises(
             LogError,
-            match=r"suffix '.txt' is not a log's; allowed: .log, .asc, .blf, .trc, .mf4, .csv, .msl, .lvm, "
+            match=r"suffix '.txt' is not a log's; allowed: .log, .asc, .blf, .trc, .mf4, .dat, .mdf, .csv, .msl, .lvm, "
             r".parquet",
         ):
             act(tmp_path / "a.txt")

@@ -11,6 +11,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import asammdf
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
@@ -347,6 +348,24 @@ def test_a_speed_that_is_0_throughout_asks_for_the_design_speed(tmp_path: Path) 
         with pytest.raises(LogError, match="--design-rpm R"):
             read_log_text(tmp_path, text)
         assert survey(tmp_path / "a.csv").suggested_rpm is None
+
+
+def test_a_workbook_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "a.xlsx").write_bytes(b"PK\x03\x04" + bytes(60))
+    with pytest.raises(LogError, match=r"suffix '\.xlsx' is not a log's; .*: save its table as CSV"):
+        read_log(tmp_path / "a.xlsx")
+
+
+@given(tables())
+@settings(max_examples=examples(2), suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_channels_of_mdf_3_are_those_that_asammdf_reads(tmp_path: Path, columns: dict[str, list[float]]) -> None:
+    with asammdf.MDF(version="3.30") as mdf:
+        t = np.array(columns["t"])
+        mdf.append([asammdf.Signal(np.array(v), t, name=k) for k, v in columns.items() if k != "t"])
+        mdf.save(tmp_path / "a.mdf", overwrite=True)
+    for name in ("a.mdf", "a.dat", "a.mf4"):
+        (tmp_path / name).write_bytes((tmp_path / "a.mdf").read_bytes())
+        holds(read_log(tmp_path / name, require=()), columns)
 
 
 def read_log_text(folder: Path, text: str) -> Log:

@@ -36,6 +36,7 @@ GROUP = "vaneloop.log_formats"
 _SUFFIX = re.compile(r"\.[a-z0-9_+-]{1,20}")  # as a script of `vaneloop completion` can hold it
 _FRAMES_SEEN = "hil.logs.bus_log:open_bus_log"
 _FRAMES_MADE = "hil.logs.bus_log:encode_channels"
+_ARCHIVE = b"PK\x03\x04"
 _CHECK = "hil.logs.source:check_file"
 _SOURCE = ("kind", "names", "notes", "sorted", "series", "has", "absent")  # what each has
 _READ = ("source", "frames", "recording", "said")
@@ -192,6 +193,11 @@ OURS = (
         source="hil.logs.mdf:open_mdf", channels="hil.logs.mdf_write:write_mdf",
         frames_out="hil.logs.mdf_write:write_bus",
         recorder="hil.logs.mdf_write:MdfRecord", recording="hil.logs.mdf:read_record_mdf",
+    ),
+    Format(
+        "MDF3", (".dat", ".mdf"), "MDF 2 and 3: channel groups, as INCA and CANape wrote them",
+        names="channels", begins=(b"MDF     3", b"MDF     2"), extra="mdf",
+        source="hil.logs.mdf:open_mdf", channels="hil.logs.mdf_write:write_mdf3",
     ),
     Format(
         "CSV", (".csv",), "a header, perhaps a row of units below it and other lines before it; `,` `;` or tab; "
@@ -370,4 +376,6 @@ def _head(path: Path) -> bytes:
 def _told(path: Path) -> str:
     """What the content of a file says, whose suffix says nothing."""
     head = _head(path)
+    if head.startswith(_ARCHIVE):
+        return "; it is a workbook, or another archive: save its table as CSV"
     return next((f"; it begins as {f.name} does ({f.suffixes[0]})" for f in OURS if head.startswith(f.begins)), "")

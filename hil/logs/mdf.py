@@ -1,4 +1,4 @@
-"""MDF4 files through asammdf, read in a process of their own.
+"""MDF files through asammdf, read in a process of their own.
 
 asammdf follows the links and sizes of a file as they stand: one flipped bit can end in a segmentation fault, an endless
 chain of blocks or an allocation of terabytes (seen in fuzzing, asammdf 8.8). A log from outside must not take its
@@ -35,7 +35,7 @@ _BUSY = 20  # times as long by the wall clock: others may have the processors, t
 
 
 class Groups(Samples):
-    """Channel groups of an MDF4 file: `CHANNEL`, or `GROUP.CHANNEL` where several groups have it."""
+    """Channel groups of an MDF file: `CHANNEL`, or `GROUP.CHANNEL` where several groups have it."""
 
     def __init__(self, content: dict[str, Any]):
         held = content["series"].items()
@@ -52,7 +52,7 @@ class Groups(Samples):
 
 
 def open_mdf(path: Path, options: Options) -> Source:
-    """MDF4: bus logging where the file holds CAN frames and a DBC is given or no channel has a name that is
+    """MDF: bus logging where the file holds CAN frames and a DBC is given or no channel has a name that is
     asked for.
     """
     wanted = [*UNITS, *options.mapping]
@@ -100,12 +100,10 @@ def read_record_mdf(path: Path) -> FramesOfRecord:
 def _answered(path: Path, request: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """What the child answers to a request on a file, and its arrays. Every reader of the format asks here."""
     head = read_bytes(path, 168)
-    if head[:8] not in (b"MDF     ", b"UnFinMF ") or len(head) < 168 or head[64:68] != b"##HD":
-        old = head[:8] == b"MDF     " and head[8:9] in (b"2", b"3")
-        raise LogError(
-            f"{path}: is not a whole MDF4 file" + (" but MDF " + head[8:12].decode("ascii", "replace") if old else "")
-        )
-    needs(f"{path}: MDF4", "asammdf")
+    old = head[8:9] in (b"2", b"3") and head[64:66] == b"HD"
+    if head[:8] not in (b"MDF     ", b"UnFinMF ") or len(head) < 168 or (head[64:68] != b"##HD" and not old):
+        raise LogError(f"{path}: is not a whole MDF file")
+    needs(f"{path}: MDF", "asammdf")
     seconds = _TIME[0] + int(check_file(path) / _TIME[1])
     request = {"path": str(path.absolute()), "seconds": seconds, **request}
     answer = _child(json.dumps(request).encode() + b"\n", _BUSY * seconds)
@@ -113,9 +111,9 @@ def _answered(path: Path, request: dict[str, Any]) -> tuple[dict[str, Any], dict
     try:
         reply = json.loads(line)
     except ValueError:
-        raise LogError(f"{path}: is damaged (the MDF4 reader could not finish it)") from None
+        raise LogError(f"{path}: is damaged (the MDF reader could not finish it)") from None
     if "error" in reply:
-        raise LogError(f"{path}: is not an MDF4 file that asammdf reads ({reply['error']})")
+        raise LogError(f"{path}: is not an MDF file that asammdf reads ({reply['error']})")
     arrays, at = {}, 0
     for name, kind, shape in reply.pop("arrays"):
         array = np.frombuffer(body, kind, int(np.prod(shape)), at).reshape(shape)

@@ -1,4 +1,4 @@
-"""The process in which an MDF4 file is opened (`hil.logs.mdf`): with limits on time and memory, as damaged files end
+"""The process in which an MDF file is opened (`hil.logs.mdf`): with limits on time and memory, as damaged files end
 asammdf.
 """
 
@@ -114,15 +114,16 @@ def _read(mdf: Any, wanted: list[str], guess: bool, arrays: dict[str, np.ndarray
             continue
         if comment:
             reply["comments"][key] = comment
-        if master is None or mdf.groups[g].channels[master].sync_type not in (0, 1):
+        if master is None or getattr(mdf.groups[g].channels[master], "sync_type", 1) not in (0, 1):
             reply["why"][key] = "its channel group has no time"
             continue
         s = mdf.get(group=g, index=i, raw=True).physical(ignore_value2text_conversions=True)
         if s.samples.ndim != 1 or s.samples.dtype.kind not in "biuf":
             reply["why"][key] = f"holds {s.samples.dtype}, not numbers"
             continue
-        source = mdf.groups[g].channels[i].source or mdf.groups[g].channel_group.acq_source
-        reply["series"][key] = (n, str(s.unit or "")[:40], bool(source and source.source_type == SOURCE_BUS))
+        source = mdf.groups[g].channels[i].source or getattr(mdf.groups[g].channel_group, "acq_source", None)
+        framed = getattr(source, "source_type", None) == SOURCE_BUS
+        reply["series"][key] = (n, str(s.unit or "")[:40], framed)
         arrays[f"t{n}"], arrays[f"v{n}"] = s.timestamps.astype(np.float64), s.samples.astype(np.float64)
     return reply
 
@@ -137,7 +138,7 @@ def _found(mdf: Any) -> list[tuple[str, int, int, str, str, int | None]]:
         if f"{_BUS}.ID" in names:
             continue
         master = mdf.masters_db.get(g)
-        label = str(group.channel_group.acq_name or "") or f"group{g}"
+        label = str(getattr(group.channel_group, "acq_name", "") or "") or f"group{g}"  # MDF 3 has none
         for i, name in enumerate(names):
             if i != master and not name.startswith(_FRAMES):
                 found.append((g, i, name, label, master))

@@ -19,7 +19,7 @@ from hil.logs.source import Channel, LogError
 from vaneloop.base.files import whole
 from vaneloop.base.signals import UNITS
 
-__all__ = ["MdfRecord", "write_bus", "write_groups", "write_mdf"]
+__all__ = ["MdfRecord", "write_bus", "write_groups", "write_mdf", "write_mdf3"]
 
 _BUS = "CAN_DataFrame"
 
@@ -29,21 +29,33 @@ def write_mdf(path: Path, channels: dict[str, Channel], dbc: Path | None) -> Non
     if dbc is not None:
         write_bus(path, encode_channels(channels, dbc, path))
         return
+    write_groups(path, _rasters(channels))
+
+
+def _rasters(channels: dict[str, Channel]) -> list[tuple[np.ndarray, dict[str, tuple[np.ndarray, str]]]]:
+    """Channels by their times: for each the times and name -> (values, unit)."""
     rasters: dict[bytes, tuple[np.ndarray, dict[str, tuple[np.ndarray, str]]]] = {}
     for name, c in channels.items():
         rasters.setdefault(c.t.tobytes(), (c.t, {}))[1][name] = c.values, UNITS[name].replace("-", "")
-    write_groups(path, list(rasters.values()))
+    return list(rasters.values())
 
 
-def write_groups(path: Path, groups: list[tuple[np.ndarray, dict[str, tuple[np.ndarray, str]]]]) -> None:
+def write_mdf3(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
+    """Channel groups of MDF 3.30, one per raster."""
+    write_groups(path, _rasters(channels), "3.30")
+
+
+def write_groups(
+    path: Path, groups: list[tuple[np.ndarray, dict[str, tuple[np.ndarray, str]]]], version: str = "4.10"
+) -> None:
     """Write channel groups: for each the times and name -> (values, unit)."""
-    with whole(path, LogError) as part, asammdf.MDF(version="4.10") as mdf:
+    with whole(path, LogError) as part, asammdf.MDF(version=version) as mdf:
         for t, channels in groups:
             mdf.append(
                 [asammdf.Signal(v, t, name=name, unit=unit) for name, (v, unit) in channels.items()], comment="VaneLoop"
             )
         with open(part, "wb+") as file:  # given the name, asammdf would put a suffix of its own behind it
-            mdf.save(file, compression=2)
+            mdf.save(file, compression=2 if version[0] == "4" else 0)
 
 
 def write_bus(path: Path, frames: Frames) -> None:
