@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import struct
+import tempfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import asammdf
 import numpy as np
@@ -16,7 +18,7 @@ from hil.logs.bus_log import encode_channels
 from hil.logs.frames import Frames
 from hil.logs.record_formats import ERROR, FD, NOTE_CHANNEL, REMOTE, append_whole
 from hil.logs.source import Channel, LogError
-from vaneloop.base.files import whole
+from vaneloop.base.files import whole, write
 from vaneloop.base.signals import UNITS
 
 __all__ = ["MdfRecord", "write_bus", "write_groups", "write_mdf", "write_mdf3"]
@@ -42,20 +44,26 @@ def _rasters(channels: dict[str, Channel]) -> list[tuple[np.ndarray, dict[str, t
 
 def write_mdf3(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
     """Channel groups of MDF 3.30, one per raster."""
-    write_groups(path, _rasters(channels), "3.30")
+    with tempfile.TemporaryDirectory() as own, asammdf.MDF(version="3.30") as mdf:
+        _append(mdf, _rasters(channels))
+        mdf.save(file := Path(own) / "log.mdf")  # a file of its own: asammdf writes MDF 3 into no other
+        write(path, file.read_bytes())
 
 
-def write_groups(
-    path: Path, groups: list[tuple[np.ndarray, dict[str, tuple[np.ndarray, str]]]], version: str = "4.10"
-) -> None:
+def _append(mdf: Any, groups: list[tuple[np.ndarray, dict[str, tuple[np.ndarray, str]]]]) -> None:
+    """Add channel groups: for each the times and name -> (values, unit)."""
+    for t, channels in groups:
+        mdf.append(
+            [asammdf.Signal(v, t, name=name, unit=unit) for name, (v, unit) in channels.items()], comment="VaneLoop"
+        )
+
+
+def write_groups(path: Path, groups: list[tuple[np.ndarray, dict[str, tuple[np.ndarray, str]]]]) -> None:
     """Write channel groups: for each the times and name -> (values, unit)."""
-    with whole(path, LogError) as part, asammdf.MDF(version=version) as mdf:
-        for t, channels in groups:
-            mdf.append(
-                [asammdf.Signal(v, t, name=name, unit=unit) for name, (v, unit) in channels.items()], comment="VaneLoop"
-            )
+    with whole(path, LogError) as part, asammdf.MDF(version="4.10") as mdf:
+        _append(mdf, groups)
         with open(part, "wb+") as file:  # given the name, asammdf would put a suffix of its own behind it
-            mdf.save(file, compression=2 if version[0] == "4" else 0)
+            mdf.save(file, compression=2)
 
 
 def write_bus(path: Path, frames: Frames) -> None:
