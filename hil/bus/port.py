@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import socket
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ RECEIVE_BUFFER = 8 << 20  # bytes that the kernel may keep for a reader: about 1
 _NET = Path("/sys/class/net")
 
 
-def open_bus(name: str, **options: Any) -> can.BusABC:
+def open_bus(name: str, **options: bool | float | str | Sequence[object] | None) -> can.BusABC:
     """Open the bus that ``name`` says: ``vcan0``, ``can0`` ... (SocketCAN), ``local[:NAME]`` (embedded),
     ``lockstep[:NAME]``.
 
@@ -34,14 +35,15 @@ def open_bus(name: str, **options: Any) -> can.BusABC:
     no such bus.
     """
     kind, _, rest = name.partition(":")
+    given: dict[str, Any] = dict(options)  # what each interface takes, it judges itself
     try:
         if kind == "local":
-            return LocalBus(rest or DEFAULT, **options)
+            return LocalBus(rest or DEFAULT, **given)
         if kind == "lockstep":
-            return LockstepBus(rest or "lockstep", **options)
+            return LockstepBus(rest or "lockstep", **given)
         if not rest and (re.fullmatch(r"v?can\d+", kind) or _is_can(kind)):
             _check_socketcan(kind)
-            return socketcan.SocketcanBus(kind, **{"fd": True, **options})
+            return socketcan.SocketcanBus(kind, **{"fd": True, **given})
     except (OSError, can.CanError) as e:
         raise InputError(
             f"--bus {name}: {getattr(e, 'strerror', None) or e}; --bus local joins the embedded bus instead"

@@ -49,7 +49,7 @@ def command(args: argparse.Namespace) -> int:
         terminal.say(args, "nothing to separate: the log leaves no rivals")
     else:
         rows = [
-            [r["profile"], f"{r['nats']:.1f}", f"{r['spreads']:.1f}", str(r["repeats"] or f"over {MOST_REPEATS}")]
+            [str(r["profile"]), f"{r['nats']:.1f}", f"{r['spreads']:.1f}", str(r["repeats"] or f"over {MOST_REPEATS}")]
             for r in e["table"]
         ]
         terminal.print_table(

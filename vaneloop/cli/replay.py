@@ -169,7 +169,7 @@ def _exceeded(result: ReplayResult, limits: dict[tuple[str, str], float]) -> lis
         judged = next((s for s in of if s.reference == "measured"), of[0])
         value = getattr(judged, statistic)
         words = "measurement" if judged.reference == "measured" else "schedule"
-        if value is not None and value > limit:
+        if value is not None and not value <= limit:  # what is no number is within no tolerance
             out.append(
                 f"{signal} {statistic} {value:.4g} {judged.unit} against the {words} exceeds {limit:g} {judged.unit}"
             )

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hil.logs.channels import Channel, Channels
+from vaneloop.identification.least_squares.problem import recalibrate
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.user_models.by_log import Logs
 from vaneloop.verbs.estimates import Fitted
@@ -74,20 +75,23 @@ def curves_of_stages(fits: Sequence[Fitted], path: str) -> Curves:
     in each window: the constant there is taken off the error.
     """
     out = []
-    for judge, fit, base in fits:
+    for judge, fit, base, start in fits:
         stage = judge.stage
-        e = judge.errors(np.array([fit.theta, base.theta])) * judge.floor[None, :, None]
+        nominal = base or recalibrate(judge)
+        e = judge.errors(np.array([fit.theta, nominal.theta])) * judge.floor[None, :, None]
         e = np.where(judge.valid, e, np.nan)
         for k, name in enumerate(stage.outputs):
             y = np.where(judge.valid[k], stage.measured[k], np.nan)
-            out.append(Curve(name, stage.name, stage.units[k], stage.t, y, e[0, k], e[1, k], float(judge.floor[k])))
+            out.append(
+                Curve(name, stage.name, stage.units[k], start + stage.t, y, e[0, k], e[1, k], float(judge.floor[k]))
+            )
     return Curves(out, path)
 
 
 def curves_of_logs(logs: Logs, theta: Array, base: Array, path: str) -> Curves:
     """Every output of a user's own system, log by log, also of those that only test it."""
     out = []
-    after, before = logs.errors(theta), logs.errors(base)
+    after, before = logs.errors(theta), logs.errors(base)  # model minus measured
     for bound in (logs.fitted, logs.test):
         if bound is None:
             continue
@@ -95,5 +99,5 @@ def curves_of_logs(logs: Logs, theta: Array, base: Array, path: str) -> Curves:
             for k, (name, unit) in enumerate(bound.system.outputs.items()):
                 floor = float(logs.fitted.floor[k])
                 y = bound.measured[k, at]
-                out.append(Curve(name, log, unit, t, y, after[log][k], before[log][k], floor))
+                out.append(Curve(name, log, unit, t, y, -after[log][k], -before[log][k], floor))
     return Curves(out, path)

@@ -24,11 +24,16 @@ COLUMNS = ("subsystem", "effect", "value", "stderr", "low", "high", "unit", "low
 
 
 class Fitted(NamedTuple):
-    """A fit of one stage: what it was fitted by, the parameters, and those of the nominal model beside it."""
+    """A fit of one stage: what it was fitted by, the parameters, and those of the nominal model beside it.
+
+    base   None: not known by now
+    start  s of the log's own time, where the stage's time is 0
+    """
 
     judge: LeastSquaresProblem
     fit: Fit
-    base: Fit
+    base: Fit | None
+    start: float = 0.0
 
 
 class NoParameter(InputError, KeyError):

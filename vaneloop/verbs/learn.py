@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from vaneloop.identification.unmodelled.learned_law import LearnedLaw
     from vaneloop.identification.vane_chain.chain import Chain
     from vaneloop.pages.page import Page
-    from vaneloop.verbs.parts import AnyLog, Parts
+    from vaneloop.verbs.parts import LogsLike, Parts
 
 __all__ = ["Learned", "learn"]
 
@@ -204,11 +204,11 @@ def law_json(law: LearnedLaw) -> dict[str, Any]:
 
 
 def learn(
-    log: AnyLog,
+    log: LogsLike,
     model: Machine | System | None = None,
     *,
     fit: Parts = (),
-    test: Parts | AnyLog = (),
+    test: Parts | LogsLike = (),
     added: Model | None = None,
     without: Sequence[str] = (),
     shape: Sequence[str] = (),
@@ -333,7 +333,7 @@ def learned(
         if new:
             kept = replace(one, tried=[one.tried[k] for k in new])
             model = _with_stage(_as_model(model, kept, [own[k] for k in new], last), last.judge, last.fit)
-            fits.append(Fitted(last.judge, last.fit, nominal_of(last)))
+            fits.append(Fitted(last.judge, last.fit, None, chain.start))
     unknown = any(s.verdict == "unknown" for s in open_ones)
     verdict = "learned" if laws else "unknown" if unknown else "named" if found.effects else "none"
     why = {
@@ -348,11 +348,6 @@ def learned(
         found, outcome, laws, None, model if laws else None, log, steps=chain.steps, fits=tuple(fits),
         decisions=decisions,
     )  # fmt: skip
-
-
-def nominal_of(last: FittedCandidate) -> Fit:
-    """The fit without its curves and laws: what the nominal model leaves."""
-    return last.judge.fit((), last.judge.stage.neutral(), 1)
 
 
 def _open(chain: Chain, d: StageDiagnosis) -> bool:

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from vaneloop.verbs.machine import Machine
     from vaneloop.verbs.replay import LogLike
 
-__all__ = ["AnyLog", "Parts", "Tested", "bind_parts", "part_of", "read_record", "records_of", "split", "tested"]
+__all__ = ["LogsLike", "Parts", "Tested", "bind_parts", "part_of", "read_record", "records_of", "split", "tested"]
 
 Part: TypeAlias = "tuple[float | None, float | None] | str"  # of a log: from, to in s; None an open end
 Parts: TypeAlias = "Part | Sequence[Part]"
-AnyLog: TypeAlias = "LogLike | Record | Sequence[LogLike | Record]"  # one or several logs, of a user's own system
+LogsLike: TypeAlias = "LogLike | Record | Sequence[LogLike | Record]"  # one or several logs, of a user's own system
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Tested:
     samples: int
 
 
-def split(fit: Parts, test: Parts | AnyLog) -> tuple[list[Span], list[Span], list[Any]]:
+def split(fit: Parts, test: Parts | LogsLike) -> tuple[list[Span], list[Span], list[Any]]:
     """Parts to fit, parts to test, and what else is to test: logs of their own. Raises InputError, one line."""
     listed = [test] if is_span(test) or not isinstance(test, Sequence) or isinstance(test, str) else list(test)
     to_fit = spans_of(fit, "--fit")
@@ -144,10 +144,10 @@ def read_record(log: LogLike, system: System, **reading: Any) -> tuple[Record, l
         read = _in_units(log, signals, needed)
     else:
         read = read_log(a_log(log), **reading, require=needed, signals=signals)
-    reference = max((read.channels[c] for c in system.outputs if c in read), key=lambda c: len(c.t))
+    reference = max((read.channels[c] for c in system.outputs if c in read.channels), key=lambda c: len(c.t))
     t = reference.t
     columns = {}
-    for c, channel in read.items():
+    for c, channel in read.channels.items():
         step = float(np.median(np.diff(channel.t))) if len(channel.t) > 1 else 0.0
         holds = c in system.inputs and channel.framed and system.holds
         v = channel.values[held(channel, t)] if holds else np.interp(t, channel.t, channel.values)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypedDict, cast
 
 import numpy as np
 
@@ -59,12 +59,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from plant import Model
+    from vaneloop.identification.least_squares.problem import Fit
     from vaneloop.identification.results import StageDiagnosis
-    from vaneloop.identification.subsystem import Bound, Stage
+    from vaneloop.identification.subsystem import Array, Bound
     from vaneloop.identification.user_models.by_log import Logs
     from vaneloop.identification.vane_chain.chain import Chain
     from vaneloop.pages.page import Page
-    from vaneloop.verbs.parts import AnyLog, Parts
+    from vaneloop.verbs.parts import LogsLike, Parts
     from vaneloop.verbs.replay import LogLike
 
 __all__ = [
@@ -132,7 +133,7 @@ class Stages(Answer):
         ]  # fmt: skip
 
     def _fits(self) -> list[Fitted]:
-        return [Fitted(LeastSquaresProblem(_stage(self.bound, x.stage), x.floor), x.fit, x.fit) for x in self.located]
+        return [_fitted(self.bound, x.stage, x.floor, x.fit, x.fit) for x in self.located]
 
     def _worked_out(self) -> Curves:
         if self.by_log is None:
@@ -202,10 +203,7 @@ class Diagnosed(Answer):
         return s.verdict
 
     def _fits(self) -> list[Fitted]:
-        return [
-            Fitted(LeastSquaresProblem(_stage(self.bound, s.stage), s.floor), s.final, s.base)
-            for s in self.diagnosis.stages
-        ]
+        return [_fitted(self.bound, s.stage, s.floor, s.final, s.base) for s in self.diagnosis.stages]
 
     def _worked_out(self) -> Curves:
         if self.by_log is None:
@@ -268,12 +266,30 @@ class Extended(Diagnosed):
         return Path(path)
 
 
+class Recommended(TypedDict):
+    """A demand profile that tells rivals apart.
+
+    score    smallest log-likelihood ratio over all pairs of rivals and all ``repeats``, nats
+    t, n_dem the profile, s and %
+    table    every profile that was tried, the best first
+    """
+
+    text: str
+    profile: str
+    score: float
+    separates: bool
+    repeats: int
+    t: Array
+    n_dem: Array
+    table: list[dict[str, object]]
+
+
 @dataclass(frozen=True, repr=False, eq=False)
 class Experiment(Answer):
     """Which demand profile would best tell the rivals of a diagnosis apart; ``recommended`` None: there are none."""
 
     diagnosed: Diagnosed
-    recommended: dict[str, Any] | None
+    recommended: Recommended | None
     log: str = ""
 
     def sentence(self) -> str:
@@ -285,13 +301,16 @@ class Experiment(Answer):
         e, notes = self.recommended, self.diagnosed.diagnosis.notes
         if e is None:
             return {"schema": 1, "log": self.log, "recommended": None, "profiles": [], "notes": notes}
-        best = {"nats": e["score"], **{k: e[k] for k in ("profile", "repeats", "separates", "text")}}
+        best = {
+            "nats": e["score"], "profile": e["profile"], "repeats": e["repeats"], "separates": e["separates"],
+            "text": e["text"],
+        }  # fmt: skip
         return {"schema": 1, "log": self.log, "recommended": best, "profiles": e["table"], "notes": notes}
 
     def rows(self) -> list[Row]:
         """A row for each profile that was tried."""
         table = self.recommended["table"] if self.recommended else []
-        return [{k: v for k, v in row.items() if not isinstance(v, dict)} for row in table]
+        return [{k: v for k, v in row.items() if k != "by_pair"} for row in table]
 
     def _fits(self) -> list[Fitted]:
         return self.diagnosed._fits()
@@ -310,11 +329,14 @@ class Experiment(Answer):
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
         d = self.diagnosed
-        return experiment_page(d.diagnosis, d.bound, command, self.log, self.sentence(), self.recommended)
+        return experiment_page(
+            d.diagnosis, d.bound, command, self.log, self.sentence(), cast("dict[str, Any] | None", self.recommended)
+        )
 
 
-def _stage(bound: Bound, name: str) -> Stage:
-    return next(s for s in bound.stages if s.name == name)
+def _fitted(bound: Bound, name: str, floor: Array, fit: Fit, base: Fit) -> Fitted:
+    stage = next(s for s in bound.stages if s.name == name)
+    return Fitted(LeastSquaresProblem(stage, floor), fit, base, getattr(bound, "start", 0.0))
 
 
 # ---- the verbs -------------------------------------------------------------------------------------------------------
@@ -324,7 +346,7 @@ def _tested_json(rows: Sequence[Tested]) -> dict[str, Any]:
     return {"tested": [asdict(row) for row in rows]} if rows else {}
 
 
-def chain_for(log: LogLike, machine: Machine, fit: Parts = (), test: Parts | AnyLog = ()) -> tuple[Chain, str]:
+def chain_for(log: LogLike, machine: Machine, fit: Parts = (), test: Parts | LogsLike = ()) -> tuple[Chain, str]:
     """A log in the stages of a machine, and the log's name."""
     to_fit, to_test, others = split(fit, test)
     if others:
@@ -333,12 +355,12 @@ def chain_for(log: LogLike, machine: Machine, fit: Parts = (), test: Parts | Any
     return bind_parts(machine, read, to_fit, to_test), read.path
 
 
-def _records(logs: AnyLog, system: System) -> list[Record]:
+def _records(logs: LogsLike, system: System) -> list[Record]:
     several = logs if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
     return [x if isinstance(x, Record) else read_record(x, system)[0] for x in several]
 
 
-def _logs(log: AnyLog, system: System, fit: Parts, test: Parts | AnyLog, added: Model | None) -> tuple[Logs, str]:
+def _logs(log: LogsLike, system: System, fit: Parts, test: Parts | LogsLike, added: Model | None) -> tuple[Logs, str]:
     """The records held against a system, and the first one's name."""
     to_fit, to_test, others = split(fit, test)
     try:
@@ -351,11 +373,11 @@ def _logs(log: AnyLog, system: System, fit: Parts, test: Parts | AnyLog, added: 
 
 
 def compare(
-    log: AnyLog,
+    log: LogsLike,
     model: Machine | System | None = None,
     *,
     fit: Parts = (),
-    test: Parts | AnyLog = (),
+    test: Parts | LogsLike = (),
     added: Model | None = None,
     progress: Progress | None = None,
 ) -> Stages:
@@ -414,11 +436,11 @@ def compared(chain: Chain, log: str, verb: str = "compare", progress: Progress |
 
 
 def locate(
-    log: AnyLog,
+    log: LogsLike,
     model: Machine | System | None = None,
     *,
     fit: Parts = (),
-    test: Parts | AnyLog = (),
+    test: Parts | LogsLike = (),
     added: Model | None = None,
     progress: Progress | None = None,
 ) -> Stages:
@@ -445,11 +467,11 @@ def locate(
 
 
 def diagnose(
-    log: AnyLog,
+    log: LogsLike,
     model: Machine | System | None = None,
     *,
     fit: Parts = (),
-    test: Parts | AnyLog = (),
+    test: Parts | LogsLike = (),
     added: Model | None = None,
     without: Sequence[str] = (),
     workers: int = 2,
@@ -542,12 +564,12 @@ def _at_limit(stages: Sequence[StageDiagnosis]) -> list[str]:
 
 
 def extend(
-    log: AnyLog,
+    log: LogsLike,
     effects: Sequence[str],
     model: Machine | System | None = None,
     *,
     fit: Parts = (),
-    test: Parts | AnyLog = (),
+    test: Parts | LogsLike = (),
     added: Model | None = None,
 ) -> Extended:
     """Add effects to the model and fit them, together with those it has.
@@ -583,6 +605,8 @@ def extend(
     ('mA', True, False)
     """
     effects = [effects] if isinstance(effects, str) else list(effects)
+    if not effects:
+        raise InputError("effects is empty; allowed: at least one effect, such as those that diagnose names")
     if isinstance(model, System):
         return _extended(*_logs(log, model, fit, test, added), effects, added)
     machine = model or Machine()
@@ -724,4 +748,5 @@ def experiment(
     if not isinstance(model, Diagnosed):
         chain, name = chain_for(log, model or Machine())
         model = diagnosed(chain, name)
-    return Experiment(model, recommend(model.diagnosis, progress, model.bound), model.log)
+    best = recommend(model.diagnosis, progress, model.bound)
+    return Experiment(model, cast("Recommended | None", best), model.log)

@@ -194,7 +194,7 @@ def try_law(law: Law, place: str, size: library.Size) -> None:
     sizes: Any = namedtuple("sizes", [p.name for p in law.parameters])  # type: ignore[misc]
     neutral = tuple(float(p.value) for p in law.parameters)
     function = getattr(law.function, "py_func", law.function)
-    for values in (neutral, *law.starts):
+    for values in (neutral, *law.sizes()):
         said = ", ".join(f"{p.name} {value:g}" for p, value in zip(law.parameters, values, strict=True))
         memory: Array = np.zeros(law.memory)
         for k in range(len(t)):

@@ -17,12 +17,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vaneloop.identification.subsystem import Array, Parameter, StageError
 from vaneloop.identification.user_models.user_laws import Law, check_parameters, is_name
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 __all__ = ["Record", "System", "unknown"]
 
@@ -48,6 +51,10 @@ class Record:
     t: Array
     columns: dict[str, Array]
     begin: float = 0.0
+
+    def __repr__(self) -> str:
+        """Name, samples and channels on one line."""
+        return f"Record({self.name!r}, {np.size(self.t):,} samples: {', '.join(self.columns)})"
 
 
 @dataclass
@@ -89,7 +96,7 @@ class System:
 
     name: str
     kind: str
-    model: Callable[..., Any]
+    model: Callable[..., object]
     outputs: dict[str, str]
     inputs: dict[str, str] = field(default_factory=dict)
     parameters: Sequence[Parameter] = ()
@@ -101,14 +108,14 @@ class System:
     rates: dict[str, str] = field(default_factory=dict)
     masses: dict[str, str] = field(default_factory=dict)
     force_unit: str = "N"
-    output: Callable[..., Any] | None = None
+    output: Callable[..., object] | None = None
     start: dict[str, float | str] = field(default_factory=dict)
     window: float | None = None
     between: str = "hold"
-    control: Callable[..., Any] | None = None
+    control: Callable[..., object] | None = None
     commands: dict[str, str] = field(default_factory=dict)
     places: Sequence[str] | None = None
-    read: Callable[[str], Mapping[str, Any]] | None = None
+    read: Callable[[str], Mapping[str, ArrayLike]] | None = None
     units: dict[str, str] = field(default_factory=dict)
     laws: Sequence[Law] = ()
     without: Sequence[str] = ()

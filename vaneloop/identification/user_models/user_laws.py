@@ -48,7 +48,7 @@ class Law:
     on: str
     function: Callable[..., float]
     parameters: Sequence[Parameter]
-    starts: Sequence[Any]
+    starts: Sequence[float | Sequence[float]]
     memory: int = 0
     places: Sequence[str] | None = None
     looks: str = ""
@@ -124,9 +124,13 @@ class Law:
         """Whether it may act at the place of that kind and name."""
         return by_default if self.places is None else place in self.places or name in self.places
 
+    def sizes(self) -> tuple[tuple[float, ...], ...]:
+        """Sizes from which a fit is tried, a number for each parameter."""
+        return tuple(tuple(float(v) for v in np.atleast_1d(start)) for start in self.starts)
+
     def as_of_library(self, code: int) -> library.Law:
         """The same as the search has it."""
-        made = tuple(self.parameters), tuple(self.starts)
+        made = tuple(self.parameters), self.sizes()
         return library.Law(self.name, code, self.looks, lambda _: made, self.looks, bool(self.memory))
 
 

@@ -71,6 +71,7 @@ class Chain:
     steps         channel -> step (border unit) in which its reading comes, where its converter's low bits are lost
     test          the stages on a part of the log that nothing is fitted to; None: there is none
     whole         of a long log, of which these are the stages of an excerpt: all of it; None: it is here whole
+    start         s of the log's own time, where ``t`` is 0
     plant, built, calibration  the machine; its controller's tables, and the same as flashed (`hil.loop.tick.flashed`)
     """
 
@@ -85,6 +86,7 @@ class Chain:
     steps: dict[str, float] = field(default_factory=dict)
     test: Chain | None = None
     whole: Any = None
+    start: float = 0.0
 
     def stage(self, name: str) -> Stage:
         """Return a stage by name."""
@@ -112,7 +114,8 @@ def build_chain(
     same_stages(geometry=machine.vanes, vane_angles=tables.vanes)
     cal = flashed(tables, machine)
     theirs = tables.program is not None  # a controller of the user's own: its servo's law is not known
-    t, columns, fresh, lacking, notes = on_raster(log, grid or grid_of(log), pieces)
+    grid = grid or grid_of(log)
+    t, columns, fresh, lacking, notes = on_raster(log, grid, pieces)
     if len(t) < 500:
         raise LogError(
             f"{log.path}: {len(t)} samples of {t[1] - t[0] if len(t) > 1 else 0:g} s; at least 500 are needed to "
@@ -245,7 +248,7 @@ def build_chain(
         stage.noise = lambda when, error, least=least: max(noise_floor(when, error), least)
         stage.floor = noise_of(stage, stage.neutral())
         stages.append(stage)
-    return Chain(t, stages, absent, columns, machine, tables, cal, notes, steps)
+    return Chain(t, stages, absent, columns, machine, tables, cal, notes, steps, start=grid.start)
 
 
 def _never_changes(values: Array) -> bool:
