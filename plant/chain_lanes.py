@@ -19,7 +19,7 @@ from plant.sensors import quantise
 from vaneloop.base.compiled import in_place, inlined
 from vaneloop.base.vanes import MOST
 
-__all__ = ["W", "feed", "fields", "move", "place", "sample_lvdt", "way"]
+__all__ = ["W", "feed", "fields", "move", "place", "sample_lvdt", "take_back", "way"]
 
 W = 64  # lanes in a block: with fewer, one chain of operations waits for itself
 HALF = chain.SUBSTEPS // 2  # plant steps that a lane takes at once, its state in registers
@@ -90,6 +90,17 @@ def place(b: Any, j: int, p: np.ndarray, s: np.ndarray, stages: int) -> None:
         _put_stem_state(b, k, j, stem.taken(s, 0, k))
         b.pot[k, j], b.pot_share[k, j], b.lever[k, j] = s[POT + k, 0], p[POT_SHARE + k, 0], d.ldp / d.length
         b.span[k, j], b.half[k, j] = linkage_lanes.ring_numbers(d.lc, d.ld)
+
+
+@in_place
+def take_back(b: Any, j: int, s: np.ndarray, stages: int) -> None:
+    """Put the state of lane ``j`` of a block back into a machine's (one lane): the inverse of `place`."""
+    drive.stored(s, 0, _state(b, j))
+    drive.told(s, 0, _plays(b, j))
+    s[N_R, 0] = b.n_r[j]
+    for k in range(stages):
+        stem.stored(s, 0, k, _stem_state(b, k, j))
+        s[POT + k, 0] = b.pot[k, j]
 
 
 @inlined

@@ -245,7 +245,7 @@ def test_a_point_of_the_unit_cube_lies_between_the_limits(monkeypatch: pytest.Mo
     g = Group("s", "c", "f")
     assert trial.model_at({}, g, TWO, [0.25, 0.5]).parameters == {"a.x": 0.0}
     assert trial.model_at({}, g, TWO, [1.0, 0.5]).effects == {"jam": {"force": 15.0}}
-    assert campaign._values(TWO, [0.25, 0.5]) == [0.0, 15.0]
+    assert plans.values_at(TWO, [0.25, 0.5]) == [0.0, 15.0]
     monkeypatch.setattr(trial, "group_machine", lambda files, g, model: SimpleNamespace(plant=("plant", model)))
     monkeypatch.setattr(
         plans,
@@ -348,12 +348,13 @@ def test_a_trial_s_file_says_what_is_to_be_done(tmp_path: Path, monkeypatch: pyt
         trial, "trial_once", lambda files, g, q, point: {"held": point[0] > 0.5, "of": [files, g, q, point]}
     )
     monkeypatch.setattr(trial, "_search", lambda *of: {"held": True, "of": list(of)})
+    monkeypatch.setattr(trial, "in_lanes", lambda files, g, q, points: [trial.Alone("why")] * len(points))
     options = {"files": {"model": "machine/m.toml"}, "vary": [asdict(q) for q in TWO], "seed": 7}
     files, g = {"model": "/run/machine/m.toml"}, Group("s", "c", "f")
     asked: dict[str, Any] = {"group": ["s", "c", "f"], "point": [0.6, 0.1]}
     whole_json(tmp_path / "t.json", asked)
     said = trial.run_trial(str(tmp_path / "t.json"), options, "/run")
-    assert said == {"verdict": "held", "answer": {"held": True, "of": [files, g, TWO, [0.6, 0.1]]}}
+    assert said == {"verdict": "held", "answer": {"held": True, "of": [files, g, TWO, [0.6, 0.1]], "alone": "why"}}
     whole_json(tmp_path / "t.json", asked | {"point": [0.5, 0.1]})
     assert trial.run_trial(str(tmp_path / "t.json"), options, "/run")["verdict"] == "failed"
     asked = {"group": ["s", "c", "f"], "search": 3}
@@ -365,8 +366,9 @@ def test_warming_up_compiles_the_loop_and_runs_a_moment(monkeypatch: pytest.Monk
     seen: list[Any] = []
     monkeypatch.setattr(trial, "warm_up", lambda told: seen.append(told("x")))
     monkeypatch.setattr(trial, "run", lambda scenario: seen.append(scenario.duration))
+    monkeypatch.setattr(trial, "warm_up_lanes", lambda: seen.append("lanes"))
     trial.run_trial.warm_up({}, "")
-    assert seen == [None, 0.1]
+    assert seen == [None, 0.1, "lanes"]
 
 
 # ---- the search ------------------------------------------------------------------------------------------------------

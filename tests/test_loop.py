@@ -13,6 +13,7 @@ from hil.bus.frames import ECU_DEMAND
 from hil.bus.lockstep_bus import run_lockstep
 from hil.inject import Machine, Scenario
 from hil.inject import injection as inject
+from hil.inject.on_lockstep import MachineChange
 from hil.logs import Channel, Log
 from hil.loop.lockstep import Stimulus, advance, columns_of, lockstep
 from hil.loop.node import Ecu, Node
@@ -153,7 +154,7 @@ def test_an_effect_injected_at_power_on_is_the_effect_in_the_machine(name: str) 
     made = machine(name)
     fixed, changed = Node(made, n_r=60.0, t_oil=T_OIL), Node(nominal(name), n_r=60.0, t_oil=T_OIL)
     engines = Ecu(made), Ecu(nominal(name))
-    change = inject.MachineChange(Machine(effect=name, parameters=GROSS[name]), changed, engines[1])
+    change = MachineChange(Machine(effect=name, parameters=GROSS[name]), changed, engines[1])
     change.tick(0)
     assert np.array_equal(changed.loop.p, fixed.loop.p) and np.array_equal(engines[1].arrays.p, engines[0].arrays.p)
     for node in (fixed, changed):
@@ -168,7 +169,7 @@ def test_an_effect_that_ends_leaves_the_calibration_as_it_was() -> None:
     node, ecu = Node(), Ecu()
     before = node.loop.calibration.k.copy(), node.loop.calibration.table.copy()
     wrong = Machine(effect="schedule_error", parameters={"offset": 1.0}, duration=0.02)
-    change, seen = inject.MachineChange(wrong, node, ecu), []
+    change, seen = MachineChange(wrong, node, ecu), []
     for k in range(40):
         change.tick(k)
         node.tick(np.zeros((0, 2), np.int64))

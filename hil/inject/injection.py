@@ -20,22 +20,17 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from controller import MODES, load_calibration
 from hil.bus import frames
-from hil.bus import wire as w
-from hil.bus.lockstep_bus import Channel
 from hil.bus.port import Port, open_bus
-from hil.bus.secoc import Authenticator
-from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
 from hil.inject.actions import (
     ACTIONS,
-    Action,
     Babble,
     BusOff,
     Corrupt,
@@ -46,25 +41,20 @@ from hil.inject.actions import (
     Flood,
     Freeze,
     Machine,
-    OnBus,
-    OnFrame,
     Outsider,
     Override,
     Reorder,
     Replay,
     Send,
-    identifier,
 )
 from hil.inject.any_controller import Reactions, expected_of_any
+from hil.inject.on_lockstep import TICK, OnLockstep, check_stages
 from hil.inject.scenario import COUNTS, Expect, Scenario, library, load_scenario
-from hil.inject.tamper import Gateway, Intruder, tick_of
+from hil.inject.tamper import Intruder
 from hil.inject.verdict import TRANSITIONS, Check, Outcome, Trace, failed, judge, outcome_of
-from hil.loop.node import Ecu, Node
-from hil.loop.secured import DEMANDED, FROM_CONTROLLER, Secured
 from hil.native.isolation import ControllerFailed, isolated
-from plant import build_plant, chain, places
+from plant import build_plant, places
 from plant.effects import EFFECTS
-from plant.parameters import derive
 from vaneloop.base.errors import InputError
 from vaneloop.base.extras import is_there
 from vaneloop.base.vanes import VANES
@@ -81,125 +71,7 @@ __all__ = [
     "run",
 ]  # fmt: skip
 
-TICK = 1e-3  # s
-SENDER = {"ECU": ("ECU_DEMAND",), "VGV": tuple(n for n in frames.NAMES.values() if n != "ECU_DEMAND")}
-
 # ---- lockstep: controller, ECU and bus in simulated time -------------------------------------------------------------
-
-
-class MachineChange:
-    """What a `Machine` action does to the machine, undone at its end: the controller's plant and calibration, the ECU's
-    engine.
-    """
-
-    def __init__(self, action: Machine, node: Node, ecu: Ecu):
-        self.loop, self.fed, self.engine = node.loop, node.arrays.supply, ecu.arrays
-        self.first, self.end = tick_of(action.start), tick_of(action.end)
-        self.new: dict[int, float] = {}
-        if action.effect is not None:
-            own = {q.name: (row, q.si) for row, q in node.plant.parameters_of(action.effect).items()}
-            for name, value in action.parameters.items():
-                if name not in own:
-                    stages = ", ".join(node.plant.vanes)
-                    raise InputError(f"parameters.{name} of {action.effect}: this machine has the vane rows {stages}")
-                row, si = own[name]
-                self.new[row] = value * si
-        self.supply = {i: v for i, v in ((0, action.p_s), (1, action.t_oil)) if v is not None}
-        if 0 in self.supply:
-            self.supply[0] *= 1e6
-        self.old: tuple[dict[int, float], dict[int, float]] = ({}, {})
-
-    def tick(self, k: int) -> None:
-        """Change the machine at the first tick, and back at the end."""
-        if k == self.first:
-            self.old = ({r: float(self.loop.p[r, 0]) for r in self.new}, {i: float(self.fed[i]) for i in self.supply})
-            self._set(self.new, self.supply)
-        elif k == self.end:
-            self._set(*self.old)
-
-    def _set(self, rows: dict[int, float], supply: dict[int, float]) -> None:
-        for i, v in supply.items():
-            self.fed[i] = v
-        if rows:
-            chain.wake(self.loop.s, self.loop.p, 0, self.loop.given.i_cmd)
-            for p in (self.loop.p, self.engine.p):
-                for r, v in rows.items():
-                    p[r, 0] = v
-                derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
-
-
-class Disturber:
-    """What happens to the bus itself: error frames with a chance, nodes in bus-off."""
-
-    def __init__(self, actions: Sequence[Action], wire: Any, places: dict[str, int]):
-        self.wire, self.places = wire, places
-        self.errors = [(tick_of(a.start), tick_of(a.end), a.probability) for a in actions if isinstance(a, ErrorFrames)]
-        self.off = [(tick_of(a.start), tick_of(a.end), places[a.node]) for a in actions if isinstance(a, BusOff)]
-        self.end = max((end for _, end, _ in (*self.errors, *self.off)), default=0.0)
-
-    def tick(self, k: int) -> None:
-        """Set the wire's state for tick ``k``."""
-        if self.errors:
-            well = 1.0
-            for first, end, probability in self.errors:
-                well *= 1.0 - probability if first <= k < end else 1.0
-            self.wire.chance[0] = 1.0 - well
-        for first, end, place in self.off:
-            node = self.wire.node[place]
-            if k == first:
-                node[w.TEC], node[w.MODE], node[w.TO_RECOVER] = 256, w.BUS_OFF, self._from_now(w.RECOVER)
-                node[w.REFUSED] += node[w.TX_N]
-                node[w.TX_N] = 0
-                node[w.BUS_OFFS] += 1
-            if end < np.inf and first <= k <= end and node[w.MODE] == w.BUS_OFF:
-                node[w.TO_RECOVER] = self._from_now(w.RECOVER) if k == end else 1 << 40
-
-    def _from_now(self, times: int) -> int:
-        """Return what ``times`` occurrences of 11 recessive bits from now on are for the wire, which counts from where
-        it became free.
-        """
-        idle = max(int(self.wire.clock[w.NOW] - self.wire.clock[w.FREE]), 0)
-        return times + -(-idle // w.RECESSIVE)
-
-
-def sender_of(action: Action) -> str:
-    """Return the node whose frames the action works on."""
-    assert isinstance(action, OnFrame)
-    ident = identifier(action.frame)
-    name = frames.NAMES.get(ident) or frames.NAMES[ident - frames.AUTH]
-    return next(who for who, names in SENDER.items() if name in names)
-
-
-def _sent_by(frame: str, plant: Plant) -> bool:
-    """Whether the machine sends the frame: not those of angles of stages that it lacks."""
-    vanes = frames.ANGLES.get(identifier(frame))
-    return vanes is None or vanes[0] in plant.vanes
-
-
-def _check_stages(name: str, scenario: Scenario, plant: Plant) -> None:
-    """Refuse a scenario that is about stages which the machine lacks: InputError."""
-    for claim in scenario.expect:
-        stage = claim.signal in VANES and claim.signal not in plant.vanes
-        if stage or (claim.late is not None and not _sent_by(claim.late, plant)):
-            raise InputError(
-                f"{name}: expect {claim.signal or claim.late}: this machine has the vane rows {', '.join(plant.vanes)}"
-            )
-
-
-def _keys(scenario: Scenario) -> tuple[Authenticator, Authenticator] | None:
-    """What makes MACs under the scenario's key, and under another; None where frames are not authenticated."""
-    if not scenario.secoc:
-        return None
-    chance = random.Random(f"{scenario.seed} keys")
-    return Authenticator(chance.randbytes(16)), Authenticator(chance.randbytes(16))
-
-
-def _secured(node: Node, ecu: Ecu, authenticator: Authenticator) -> tuple[Any, Any]:
-    """Both nodes with authentication; the freshness value of a tick is its number."""
-    both = Secured(node, authenticator, DEMANDED), Secured(ecu, authenticator, FROM_CONTROLLER)
-    for one in both:
-        one.gate.correct(0, 0)
-    return both
 
 
 def _lockstep(
@@ -215,63 +87,21 @@ def _lockstep(
     if why := lacks(scenario, plant):
         raise InputError(f"{name}: {why}")
     started = time.perf_counter()
-    points = np.array(scenario.demand)
-    _check_stages(name, scenario, plant)
-    node = Node(plant, calibration, n_r=float(points[0, 1]), seed=scenario.seed)
-    ecu = Ecu(plant, n_dem=float(points[0, 1]), seed=scenario.seed + 1)
-    ticks = round(scenario.duration * 1000.0)
-    of = {kind: [a for a in scenario.inject if isinstance(a, kind)] for kind in (OnFrame, Outsider, OnBus, Machine)}
-    chance = [random.Random(f"{scenario.seed} {i}") for i in range(len(of[Outsider]) + 2)]
-    gateways = [
-        Gateway([a for a in of[OnFrame] if sender_of(a) == who], c)
-        for who, c in zip(("ECU", "VGV"), chance, strict=False)
-    ]
-    recorded: list[tuple[int, int, int]] = []
-    keep = any(isinstance(a, Replay) and a.begin is not None for a in scenario.inject)
-    keys = _keys(scenario)
-    vgv, demanding = (node, ecu) if keys is None else _secured(node, ecu, keys[0])
-    intruders = [Intruder(a, c, recorded, keys) for a, c in zip(of[Outsider], chance[2:], strict=True)]
-    machines = [MachineChange(a, node, ecu) for a in of[Machine]]  # type: ignore[arg-type]
-    channel = Channel(seed=scenario.seed)
-    wire, join = channel.wire, channel.join
-    stations = {"ECU": join(), "VGV": join()}
-    outside = [join() for _ in intruders]
-    ears = join(silent=True) if keep else -1
-    disturber = Disturber(of[OnBus], wire, stations)
-    rows = np.zeros((256, 2), np.int64)
-
-    z, s, receiver = node.loop.state, node.loop.s, node.arrays.receiver
+    check_stages(name, scenario, plant)
+    loop = OnLockstep(scenario, plant, calibration)
+    node, ticks, stages = loop.node, round(scenario.duration * 1000.0), len(plant.vanes)
+    z, s = node.loop.state, node.loop.s
     mode, faults = np.empty(ticks, np.int8), np.empty(ticks, np.int64)
-    stages, heard = len(plant.vanes), [n for n in SENDER["VGV"] if _sent_by(n, plant)]
     values = np.empty((ticks, 5 + stages))
     counts = np.empty((ticks, len(COUNTS)), np.int64)
-    late = np.zeros((ticks, len(heard)), bool)
+    late = np.zeros((ticks, len(loop.heard)), bool)
     to_border = np.array([1e3, 1e3, 1e3, 1.0, 1.0, *([180.0 / np.pi] * stages)])
     for k in range(ticks):
-        if k % 10 == 0:
-            ecu.set_demand(float(np.interp(k * TICK, points[:, 0], points[:, 1])))
-        for m in machines:
-            m.tick(k)
-        disturber.tick(k)
-        from_ecu = demanding.tick(rows, take(wire, stations["ECU"], rows)).tolist()
-        from_vgv = vgv.tick(rows, take(wire, stations["VGV"], rows)).tolist()
+        loop.tick()
         mode[k], faults[k] = z.mode, z.faults
         values[k] = (z.x_dem, z.x_meas, z.i_cmd, z.n_dem, z.n_r_raw, *s[places.POT : places.POT + stages, 0])
-        counts[k, :8] = receiver[:8]
-        counts[k, 8], counts[k, 9] = frames.refused(receiver), receiver[frames.R_UNAUTHENTIC]
-        if k % 10 == 0:
-            missed = ecu.stale()
-            late[k : k + 10] = [n in missed for n in heard]
-        for who, gateway, sent in zip(("ECU", "VGV"), gateways, (from_ecu, from_vgv), strict=True):
-            for head, data in gateway.feed(k, sent):
-                put(wire, stations[who], head, data)
-        for place, intruder in zip(outside, intruders, strict=True):
-            if intruder.first <= k < intruder.end:
-                for head, data in intruder.tick(k, int(wire.node[place, TX_N])):
-                    put(wire, place, head, data)
-        run_wire(wire, (k + 1) * BITS_PER_TICK, -1)
-        if keep:
-            recorded += [(k, head, data) for head, data in rows[: take(wire, ears, rows)].tolist()]
+        counts[k] = loop.counts()
+        late[k] = [n in loop.missed for n in loop.heard]
         if progress is not None and k % 1000 == 0:
             progress(k / ticks)
     cal = node.loop.calibration.scalars
@@ -281,7 +111,7 @@ def _lockstep(
         faults,
         dict(zip(("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", *plant.vanes), (values * to_border).T, strict=True)),
         dict(zip(COUNTS, counts.T, strict=True)),
-        dict(zip(heard, late.T, strict=True)),
+        dict(zip(loop.heard, late.T, strict=True)),
         (float(cal.stroke_min) * 1e3, float(cal.stroke_max) * 1e3),
         float(cal.current_limit) * 1e3,
         ours=reactions is None,

@@ -24,13 +24,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.inject.scenario import Expect, Scenario
-from hil.inject.verdict import Outcome, Trace
+from hil.inject.verdict import Facts, Outcome, facts_of
 
-__all__ = ["Margin", "margins"]
+__all__ = ["Margin", "margin_of", "margins", "without_distance"]
 
 _TICK = 1e-3  # s
 _UNITS = {"x_dem": "mm", "x_lvdt": "mm", "i_cmd": "mA", "n_dem": "%", "n_r": "%"}
-_EDGE = 1e-9  # a claim that is broken has a share below zero, also where its distance rounds to nothing
+_BROKEN = 1e-9  # a claim that is broken has a share below zero, also where its distance rounds to nothing
 
 
 @dataclass(frozen=True)
@@ -60,11 +60,22 @@ def margins(scenario: Scenario, outcome: Outcome) -> list[Margin]:
     for i, check in enumerate(outcome.checks):
         if check.held is None:
             continue
-        value, unit, whole = np.nan, "", 1.0
-        if i < claims:
-            value, unit, whole = _distance(scenario.expect[i], outcome.trace, check.held)
-        out.append(_margin(check.expected, check.held, value, unit, whole))
+        facts = facts_of(scenario.expect[i], outcome.trace) if i < claims else None
+        if facts is None:
+            out.append(without_distance(check.expected, check.held))
+        else:
+            out.append(margin_of(scenario.expect[i], facts, check.held))
     return out
+
+
+def margin_of(claim: Expect, facts: Facts, held: bool) -> Margin:
+    """Margin of a claim with its verdict."""
+    return _margin(claim.words, held, *_distance(claim, facts, held))
+
+
+def without_distance(expected: str, held: bool) -> Margin:
+    """Margin of what is always demanded: broken or not."""
+    return _margin(expected, held, np.nan, "", 1.0)
 
 
 def _margin(expected: str, held: bool, value: float, unit: str, whole: float) -> Margin:
@@ -76,46 +87,30 @@ def _margin(expected: str, held: bool, value: float, unit: str, whole: float) ->
         )  # fmt: skip
     if not np.isfinite(share):
         return Margin(expected, False, np.nan, unit, -1.0)
-    return Margin(expected, False, min(value, 0.0), unit, min(share, -_EDGE))
+    return Margin(expected, False, min(value, 0.0), unit, min(share, -_BROKEN))
 
 
-def _distance(claim: Expect, trace: Trace, held: bool) -> tuple[float, str, float]:
+def _distance(claim: Expect, facts: Facts, held: bool) -> tuple[float, str, float]:
     """Distance, its unit, and what it is a share of; NaN: nothing measures it."""
-    truth = trace.truth(claim)
-    assert truth is not None  # on lockstep everything is seen
-    t, nothing = trace.t, (np.nan, "s", 1.0)
     if claim.at is not None:
-        rises = t[truth & ~np.concatenate([[False], truth[:-1]])]
-        if not len(rises):
-            return nothing
-        return claim.tolerance - float(np.min(np.abs(rises - claim.at))), "s", claim.tolerance
+        return claim.tolerance - facts.nearest if np.isfinite(facts.nearest) else np.nan, "s", claim.tolerance
     if claim.by is not None:
-        when = t[truth & (t >= claim.after - _EDGE)]
-        if len(when):
-            return claim.by - float(when[0]), "s", claim.by - claim.after
-        return _to_band(claim, trace, t >= claim.after) if claim.signal else nothing
-    begin, end = claim.during or (0.0, float(t[-1]))
-    inside = (t >= begin - _EDGE) & (t <= end + _EDGE)
+        if np.isfinite(facts.first):
+            return claim.by - facts.first, "s", claim.by - claim.after
+        return (facts.best, *_band(claim)) if claim.signal else (np.nan, "s", 1.0)
     if claim.signal and not claim.never:
-        return _to_band(claim, trace, inside, nearest=False)
-    broken = truth if claim.never else ~truth
+        return facts.worst, *_band(claim)
+    begin = claim.during[0] if claim.during else 0.0
     if not held:
-        return -float(np.sum(broken & inside)) * _TICK, "s", end - begin
-    if claim.never:
-        return nothing
-    earlier = t[broken & (t < begin)]
-    return (begin - float(earlier[-1]) - _TICK if len(earlier) else np.nan), "s", begin
+        return -facts.broken * _TICK, "s", (claim.during[1] if claim.during else (facts.seen - 1) * _TICK) - begin
+    if claim.never or not np.isfinite(facts.last):
+        return np.nan, "s", 1.0
+    return begin - facts.last - _TICK, "s", begin
 
 
-def _to_band(claim: Expect, trace: Trace, inside: np.ndarray, nearest: bool = True) -> tuple[float, str, float]:
-    """Distance of a signal to its limits: of its best sample (``nearest``), or of its worst."""
-    values = trace.signals[str(claim.signal)][inside]
+def _band(claim: Expect) -> tuple[str, float]:
+    """Unit of a signal, and what its distance is a share of: half of its band, or its limit."""
     low = -np.inf if claim.low is None else claim.low
     high = np.inf if claim.high is None else claim.high
-    both = np.isfinite([low, high]).all()
-    whole = 0.5 * (high - low) if both else abs(low if np.isfinite(low) else high)
-    distance = np.minimum(values - low, high - values)
-    unit = _UNITS.get(str(claim.signal), "deg")
-    if not len(distance) or np.isnan(distance).any():
-        return np.nan, unit, 1.0
-    return float(np.max(distance) if nearest else np.min(distance)), unit, whole or 1.0
+    whole = 0.5 * (high - low) if np.isfinite([low, high]).all() else abs(low if np.isfinite(low) else high)
+    return _UNITS.get(str(claim.signal), "deg"), whole or 1.0

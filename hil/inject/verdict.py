@@ -1,7 +1,8 @@
 """The verdict on a scenario: what was seen, held against what must be seen.
 
 Every claim of the scenario is judged; besides them, safe limits of stroke demand and current, and the documented mode
-changes, always.
+changes, always. What a claim's verdict and its margin follow from are its `Facts`: taken from a `Trace`, or while loops
+run side by side (`hil.inject.in_lanes`).
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ import numpy as np
 from controller import FAULTS, MODES
 from hil.inject.scenario import Expect, Scenario
 
-__all__ = ["TRANSITIONS", "Check", "Outcome", "Trace", "failed", "judge", "outcome_of"]
+__all__ = [
+    "CHANGES", "EDGE", "ROUNDING", "TRANSITIONS", "Check", "Facts", "Outcome", "Trace", "always", "facts_of", "failed",
+    "holds", "judge", "outcome_of",
+]  # fmt: skip
 
 # docs/controller.md, "Modes": these and no others
 TRANSITIONS = frozenset({
@@ -26,6 +30,10 @@ TRANSITIONS = frozenset({
 SLACK = (
     0.05  # s: what frames every 10 ms, another clock and a busy machine may add to a time on a bus between processes
 )
+
+EDGE = 1e-9  # s: rounding of a time
+ROUNDING = 1e-6  # mm, mA, beyond the safe limits
+CHANGES = "mode changes as documented"
 
 # ---- what was seen ---------------------------------------------------------------------------------------------------
 
@@ -101,31 +109,101 @@ class Check:
     because: str = ""
 
 
-def _check(claim: Expect, trace: Trace, slack: float, lockstep: bool) -> Check:
-    truth = trace.truth(claim) if lockstep or claim.only is None else None
+@dataclass(frozen=True)
+class Facts:
+    """What a claim's verdict and margin follow from.
+
+    nearest      s, from ``at`` to the nearest time at which the condition became true; inf: it never did
+    first        s, when it first was true from ``after`` on; inf: never
+    best, worst  distance of a signal to the nearer limit, from ``after`` on, or within ``during``: of its best and its
+                 worst sample; NaN where one is no number
+    seen, broken samples within ``during`` (all, where it is not given), and those of them that break the claim
+    last         s, of the last sample before ``during`` that would break it; -inf: none
+    """
+
+    nearest: float = np.inf
+    first: float = np.inf
+    best: float = np.nan
+    worst: float = np.nan
+    seen: int = 0
+    broken: int = 0
+    last: float = -np.inf
+
+
+def facts_of(claim: Expect, trace: Trace, slack: float = 0.0) -> Facts | None:
+    """Facts of a claim in a trace, whose times may be off by ``slack`` (s); None where this bus does not show it."""
+    truth, t = trace.truth(claim), trace.t
     if truth is None:
-        why = "only lockstep has this timing" if claim.only else "the frames on this bus do not show it"
-        return Check(claim.words, why, None, claim.because)
-    t = trace.t
+        return None
     if claim.at is not None:
         rises = t[truth & ~np.concatenate([[False], truth[:-1]])]
-        near = rises[np.abs(rises - claim.at) <= claim.tolerance + slack + 1e-9]
-        seen = ", ".join(f"{x:.3f}" for x in rises[:6]) + (f" and {len(rises) - 6} more" if len(rises) > 6 else "")
-        return Check(claim.words, f"from {seen} s on" if len(rises) else "never", bool(len(near)), claim.because)
+        return Facts(nearest=float(np.min(np.abs(rises - claim.at), initial=np.inf)))
     if claim.by is not None:
-        when = t[truth & (t >= claim.after - 1e-9) & (t <= claim.by + slack + 1e-9)]
-        if len(when):
-            return Check(claim.words, f"at {when[0]:.3f} s", True, claim.because)
-        later = t[truth & (t >= claim.after)]
-        return Check(claim.words, f"not before {later[0]:.3f} s" if len(later) else "never", False, claim.because)
+        inside = t >= claim.after - EDGE
+        return Facts(first=float(np.min(t[truth & inside], initial=np.inf)), **_distances(claim, trace, inside))
     begin, end = claim.during or (0.0, float(t[-1]))
-    inside = (t >= begin + slack - 1e-9) & (t <= end - slack + 1e-9) if claim.during else np.ones(len(t), bool)
+    inside = (t >= begin + slack - EDGE) & (t <= end - slack + EDGE) if claim.during else np.ones(len(t), bool)
+    broken = truth if claim.never else ~truth
+    last = float(np.max(t[broken & (t < begin - EDGE)], initial=-np.inf))
+    return Facts(
+        seen=int(np.sum(inside)), broken=int(np.sum(broken & inside)), last=last, **_distances(claim, trace, inside)
+    )
+
+
+def _distances(claim: Expect, trace: Trace, inside: np.ndarray) -> dict[str, float]:
+    """Distances of a signal to its limits (`Facts`)."""
+    if claim.signal is None or not inside.any():
+        return {}
+    values = trace.signals[claim.signal][inside]
+    low = -np.inf if claim.low is None else claim.low
+    high = np.inf if claim.high is None else claim.high
+    distance = np.minimum(values - low, high - values)
+    return {"best": float(np.max(distance)), "worst": float(np.min(distance))}
+
+
+def holds(claim: Expect, facts: Facts, slack: float = 0.0) -> bool:
+    """Whether a claim holds."""
+    if claim.at is not None:
+        return facts.nearest <= claim.tolerance + slack + EDGE
+    if claim.by is not None:
+        return facts.first <= claim.by + slack + EDGE
+    return facts.seen > 0 and facts.broken == 0
+
+
+def _check(claim: Expect, trace: Trace, slack: float, lockstep: bool) -> Check:
+    facts = facts_of(claim, trace, slack) if lockstep or claim.only is None else None
+    if facts is None:
+        why = "only lockstep has this timing" if claim.only else "the frames on this bus do not show it"
+        return Check(claim.words, why, None, claim.because)
+    return Check(claim.words, _seen(claim, trace, slack, facts), holds(claim, facts, slack), claim.because)
+
+
+def _seen(claim: Expect, trace: Trace, slack: float, facts: Facts) -> str:
+    """What a trace shows of a claim, in words."""
+    t, truth = trace.t, trace.truth(claim)
+    assert truth is not None
+    if claim.at is not None:
+        rises = t[truth & ~np.concatenate([[False], truth[:-1]])]
+        seen = ", ".join(f"{x:.3f}" for x in rises[:6]) + (f" and {len(rises) - 6} more" if len(rises) > 6 else "")
+        return f"from {seen} s on" if len(rises) else "never"
+    if claim.by is not None:
+        if facts.first == np.inf:
+            return "never"
+        return f"at {facts.first:.3f} s" if holds(claim, facts, slack) else f"not before {facts.first:.3f} s"
+    begin, end = claim.during or (0.0, float(t[-1]))
+    inside = (t >= begin + slack - EDGE) & (t <= end - slack + EDGE) if claim.during else np.ones(len(t), bool)
     broken = inside & (truth if claim.never else ~truth)
     if not inside.any():
-        return Check(claim.words, "nothing was seen then", False, claim.because)
+        return "nothing was seen then"
     if broken.any():
-        return Check(claim.words, f"broken at {t[broken][0]:.3f} s: {trace.shown(claim, broken)}", False, claim.because)
-    return Check(claim.words, trace.shown(claim, inside), True, claim.because)
+        return f"broken at {t[broken][0]:.3f} s: {trace.shown(claim, broken)}"
+    return trace.shown(claim, inside)
+
+
+def always(stroke: tuple[float, float], current: float) -> list[tuple[str, float, float, str, str]]:
+    """Safe limits that are always demanded: signal, least, most, unit, and the demand in words."""
+    limits = (("x_dem", *stroke, "mm"), ("i_cmd", -current, current, "mA"))
+    return [(n, least, most, unit, f"always {least:g} <= {n} <= {most:g} {unit}") for n, least, most, unit in limits]
 
 
 def judge(scenario: Scenario, trace: Trace, *, lockstep: bool = True) -> list[Check]:
@@ -134,23 +212,17 @@ def judge(scenario: Scenario, trace: Trace, *, lockstep: bool = True) -> list[Ch
     """
     slack = 0.0 if lockstep else SLACK
     checks = [_check(claim, trace, slack, lockstep) for claim in scenario.expect]
-    low, high = trace.stroke
-    count = 1e-6 if trace.exact else 2e-3  # frames round
-    for name, least, most, unit in (("x_dem", low, high, "mm"), ("i_cmd", -trace.current, trace.current, "mA")):
+    count = ROUNDING if trace.exact else 2e-3  # frames round
+    for name, least, most, unit, words in always(trace.stroke, trace.current):
         values = trace.signals.get(name, np.empty(0))
         good = bool(np.all((values >= least - count) & (values <= most + count)))  # NaN is not good
         seen = f"{np.min(values):.4g} to {np.max(values):.4g} {unit}" if len(values) else "nothing"
-        checks.append(Check(f"always {least:g} <= {name} <= {most:g} {unit}", seen, good and len(values) > 0))
+        checks.append(Check(words, seen, good and len(values) > 0))
     changes = [(MODES[a], MODES[b]) for a, b in zip(trace.mode, trace.mode[1:], strict=False) if a != b]
     if trace.exact and trace.ours:
         wrong = [f"{a} > {b}" for a, b in changes if (a, b) not in TRANSITIONS]
-        checks.append(
-            Check(
-                "mode changes as documented",
-                "not: " + ", ".join(wrong) if wrong else f"{len(changes)} changes",
-                not wrong,
-            )
-        )
+        seen = "not: " + ", ".join(wrong) if wrong else f"{len(changes)} changes"
+        checks.append(Check(CHANGES, seen, not wrong))
     return checks
 
 

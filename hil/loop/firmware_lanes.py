@@ -19,7 +19,7 @@ from plant.chain_lanes import W
 from plant.lanes import filler, on_stack, wide_vectors
 from vaneloop.base.compiled import inlined
 
-__all__ = ["between_frames", "fields", "on_frame", "place", "runs_in_lanes"]
+__all__ = ["between_frames", "fields", "flash", "on_frame", "on_late_frame", "place", "runs_in_lanes"]
 
 
 def _first(of: tuple[Field, ...], before: str) -> dict[str, int]:
@@ -54,9 +54,15 @@ def runs_in_lanes(calibration: Calibration) -> bool:
 
 def place(b: Any, j: int, loop: Loop) -> None:
     """Put a loop's controller into lane ``j`` of a block (a numpy record)."""
-    for prefix, names, of in (("z_", _STATE, loop.state), ("k_", _SCALARS, loop.calibration.scalars)):
-        for name in names:
-            b[prefix + name][..., j] = of[name]
+    for name in _STATE:
+        b[f"z_{name}"][..., j] = loop.state[name]
+    flash(b, j, loop.calibration)
+
+
+def flash(b: Any, j: int, calibration: Calibration) -> None:
+    """Put a calibration's scalars into lane ``j`` of a block (a numpy record)."""
+    for name in _SCALARS:
+        b[f"k_{name}"][..., j] = calibration.scalars[name]
 
 
 @inlined
@@ -118,3 +124,16 @@ def between_frames(b: Any, n: int, phase: int) -> None:
         watch(inputs1, z1, k1)
         act(z1, k1, phase)
         _put_state(b, j, z1)
+
+
+@inlined
+def on_late_frame(b: Any, n: int, phase: int) -> None:
+    """The firmware's tick of ``n`` lanes, the ``phase``-th of ten and not the first, with the inputs in the block."""
+    wide_vectors()
+    inputs, z, k = on_stack(_Inputs), on_stack(_State), on_stack(_Scalars)
+    for j in range(n):
+        _take_inputs(b, j, inputs), _take_state(b, j, z), _take_scalars(b, j, k)
+        inputs.pause = 0.0
+        watch(inputs, z, k)
+        act(z, k, phase)
+        _put_state(b, j, z)

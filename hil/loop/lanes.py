@@ -44,7 +44,7 @@ from plant.stages.blocks import on_all_cores
 from vaneloop.base.compiled import compiled, in_place_free
 from vaneloop.base.vanes import VANES
 
-__all__ = ["Lanes", "for_each", "lockstep_lanes", "loops_of"]
+__all__ = ["BLOCK", "EIGHT", "Lanes", "aligned", "for_each", "lockstep_lanes", "loops_of", "place_machine"]
 
 EIGHT = 8  # lanes of a vector: a block runs a multiple of it
 LINE = 64  # bytes of a line of the cache
@@ -54,7 +54,8 @@ BLOCK = np.dtype([*firmware_lanes.fields(), *chain_lanes.fields(), *((name, np.f
 
 
 @compiled
-def _place(block: np.ndarray, j: int, p: np.ndarray, s: np.ndarray, stages: int) -> None:
+def place_machine(block: np.ndarray, j: int, p: np.ndarray, s: np.ndarray, stages: int) -> None:
+    """Put a machine into lane ``j`` of a block (`plant.chain_lanes.place`)."""
     chain_lanes.place(block[0], j, p, s, stages)
 
 
@@ -225,10 +226,10 @@ class Lanes:
         self._way, self._stages = way, len(loops[0].angles)
         last = len(loops) - 1
         filled = [loops[min(j, last)] for j in range(n)]
-        self._block = _aligned(BLOCK)
+        self._block = aligned(BLOCK)
         for j, loop in enumerate(filled):
             firmware_lanes.place(self._block[0], j, loop)
-            _place(self._block, j, loop.p, loop.s, self._stages)
+            place_machine(self._block, j, loop.p, loop.s, self._stages)
             self._block[0]["sigma_lvdt"][j], self._block[0]["sigma_speed"][j] = loop.sigma[0], loop.sigma[-1]
         self._sigma_pots = np.array([loop.sigma[1:-1] for loop in filled])
         self._tables = np.array([loop.calibration.table for loop in filled])
@@ -264,7 +265,7 @@ class Lanes:
         return int(self._block[0]["z_faults"][lane])
 
 
-def _aligned(layout: np.dtype[Any]) -> np.ndarray:
+def aligned(layout: np.dtype[Any]) -> np.ndarray:
     """One record of zeros that begins with a line of the cache: a vector that lies across two lines takes longer."""
     memory = np.zeros(layout.itemsize + LINE, np.uint8)
     start = -memory.ctypes.data % LINE

@@ -121,6 +121,8 @@ def _show(args: argparse.Namespace, view: CampaignView, search: int) -> None:
             if r.fails:
                 where = f"in {r.broken} of {r.trials} machines" if r.broken else "by the search's worst machine"
                 terminal.say(args, f"broken {where}: {g.name}: {r.expected}")
+        for why, n in g.alone.items():
+            terminal.say(args, f"on the lockstep bus, not in lanes: {n} of {g.trials} machines of {g.name}: {why}")
         if g.lost:
             terminal.say(args, f"without an answer: {g.lost} trials of {g.name}; vaneloop fleet status says what came")
         if search and not g.runs:

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import fnmatch
 import json
+import math
 import shlex
+from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -134,14 +136,19 @@ def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[
         worst = min([*done, *([search] if search else [])], key=lambda r: (worst_share(r, among), r["point"]))
         failed = sum(not r["held"] for r in done)
         low, high = interval(failed, len(done), plan.confidence)
+        by_search, agreed = worst is search, True
+        if worst.get("alone") == "":  # a verdict from lanes is proved on the lockstep bus
+            worst, lanes = trial_once(files, g, quantities, worst["point"]), worst
+            agreed = _agree(worst, lanes)
         saved, command, same = _save(folder, files, plan, g, quantities, worst)
         shares, points = [worst_share(r, among) for r in done], [r["point"] for r in done]
         least, runs = worst_share(worst, among), search["runs"] if search else 0
+        alone = dict(Counter(r["alone"] for r in done if r.get("alone")))
         first, total = _indices(plan, quantities, folder, g, rows, among)
         shown.append(GroupView(
             g.name, g.scenario, g.calibration, g.firmware, len(done), len(rows) - len(done), failed, low, high,
-            _requirements(done, search), shares, points, _values(quantities, worst["point"]), least, worst is search,
-            runs, worst["seen"], worst["state_hash"], str(saved), command, same, first, total,
+            _requirements(done, search), shares, points, plans.values_at(quantities, worst["point"]), least, by_search,
+            runs, worst["seen"], worst["state_hash"], str(saved), command, same and agreed, first, total, alone,
         ))  # fmt: skip
         told((k + 1) / len(all_groups))
     return CampaignView(
@@ -150,8 +157,16 @@ def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[
     )  # fmt: skip
 
 
-def _values(quantities: list[Varied], point: Iterable[float]) -> list[float]:
-    return [q.low + u * (q.high - q.low) for q, u in zip(quantities, point, strict=True)]
+def _agree(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Whether two answers say the same: verdicts and, to rounding, margins."""
+    pairs = list(zip(one["margins"], other["margins"], strict=False))
+    return len(one["margins"]) == len(other["margins"]) and all(
+        (a["expected"], a["held"]) == (b["expected"], b["held"]) and _close(a["value"], b["value"]) for a, b in pairs
+    )
+
+
+def _close(a: float | None, b: float | None) -> bool:
+    return a == b or (a is not None and b is not None and math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-9))
 
 
 def _requirements(done: list[dict[str, Any]], search: dict[str, Any] | None) -> list[Requirement]:

@@ -59,15 +59,17 @@ class Kind:
 
     function  module and name; called with an entry's path, the options and the run's folder; returns what JSON holds
     options   what run.json may tell it
+    together  whether it is quicker with many entries at once: it is called with the paths of those to come, too
     """
 
     function: tuple[str, str]
     options: type[Options]
+    together: bool = False
 
 
 KINDS = {
     DIAGNOSIS: Kind(("vaneloop.fleet.diagnosis", "diagnose_log"), _Diagnosis),
-    TRIAL: Kind(("vaneloop.fleet.trial", "run_trial"), _Trial),
+    TRIAL: Kind(("vaneloop.fleet.trial", "run_trial"), _Trial, together=True),
 }
 
 

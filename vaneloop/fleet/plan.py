@@ -24,7 +24,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -44,7 +44,7 @@ from vaneloop.verbs.machine import Machine
 
 __all__ = [
     "LEAST", "Group", "Plan", "Varied", "as_options", "base_model", "draw", "files_of_plan", "group_machine", "groups",
-    "load_plan", "model_of", "scenario_of", "varied",
+    "load_plan", "model_of", "scenario_of", "values_at", "varied",
 ]  # fmt: skip
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,60}")
@@ -231,6 +231,11 @@ def varied(plan: Plan, plant: Plant, source: str | Path) -> list[Varied]:
         if not out[-1].low < out[-1].high:
             raise InputError(f"{at}: low (={out[-1].low:g}) must be below high (={out[-1].high:g})")
     return out
+
+
+def values_at(quantities: Sequence[Varied], point: Iterable[float]) -> list[float]:
+    """Values of the quantities at a point of the unit cube."""
+    return [q.low + u * (q.high - q.low) for q, u in zip(quantities, point, strict=True)]
 
 
 def model_of(quantities: list[Varied], values: list[float], base: Model | None = None) -> Model:

@@ -19,7 +19,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,12 +68,14 @@ class Reader:
         self.kind, self.folder, self.stopped = kind, folder, stopped
         self.process: subprocess.Popen[bytes] | None = None
 
-    def ask(self, path: str, options: dict[str, Any], limit: float) -> dict[str, Any]:
-        """What the function says of a log. Raises Died, TimedOut (after ``limit`` s), Stopped, NotReady, or OSError."""
+    def ask(self, path: str, options: dict[str, Any], limit: float, beside: Sequence[str] = ()) -> dict[str, Any]:
+        """What the function says of a log; ``beside``: what will be asked for next. Raises Died, TimedOut (after
+        ``limit`` s), Stopped, NotReady, or OSError.
+        """
         try:
             if self.process is None:
                 self._ready(options)
-            return self._answer({"path": path, "options": options}, limit)
+            return self._answer({"path": path, "options": options, "beside": list(beside)}, limit)
         except BrokenPipeError:
             raise Died(f"the process that read it ended with {self._ended()}") from None
         except (Stopped, TimedOut):
@@ -168,7 +170,9 @@ def serve() -> None:
         asked = json.loads(line)
         try:
             if "path" in asked:
-                answer = {"status": "done", "reason": "", **function(asked["path"], asked["options"], sys.argv[2])}
+                more = [asked["beside"]] if KINDS[sys.argv[1]].together else []
+                said = function(asked["path"], asked["options"], sys.argv[2], *more)
+                answer = {"status": "done", "reason": "", **said}
             else:
                 _warm_up(getattr(function, "warm_up", None), asked["options"], sys.argv[2])
                 answer = {}

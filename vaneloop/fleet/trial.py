@@ -7,7 +7,9 @@ their margins).
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,8 +18,9 @@ import scipy
 from pydantic import BaseModel, Field, ValidationError
 
 from hil.inject.any_controller import SHIPPED, expected_of_any, load_reactions
+from hil.inject.in_lanes import warm_up_lanes
 from hil.inject.injection import run
-from hil.inject.margin import margins
+from hil.inject.margin import Margin, margins
 from hil.inject.scenario import Scenario
 from hil.inject.verdict import Outcome
 from hil.loop.lockstep import warm_up
@@ -25,21 +28,57 @@ from plant import Model
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Finite, Table
 from vaneloop.fleet.files import read_json
-from vaneloop.fleet.plan import Group, Varied, base_model, group_machine, model_of, scenario_of
+from vaneloop.fleet.plan import Group, Varied, base_model, group_machine, model_of, scenario_of, values_at
+from vaneloop.fleet.together import Alone, in_lanes
 
 __all__ = ["is_answer", "model_at", "moving", "run_trial", "trial_once", "worst_share"]
 
 
-def run_trial(path: str, options: dict[str, Any], run_folder: str) -> dict[str, Any]:
-    """Do what the file asks for; the answer has the point, the margins and the state's digest of the (worst) run."""
+def run_trial(path: str, options: dict[str, Any], run_folder: str, beside: Sequence[str] = ()) -> dict[str, Any]:
+    """Do what the file asks for; the answer has the point, the margins and the state's digest of the (worst) run.
+
+    beside  files of trials that will be asked for next: those of the same group run in lanes with this one, and their
+            answers are kept until then
+    """
     asked = _asked(path)
     files = {name: str(Path(run_folder) / f) for name, f in options["files"].items()}
     g, quantities = Group(*asked["group"]), [Varied(**q) for q in options["vary"]]
     if "search" not in asked:
-        answer = trial_once(files, g, quantities, asked["point"])
+        answer = _sample(files, g, quantities, asked, beside)
     else:
         answer = _search(files, g, quantities, asked, int(options["seed"]))
     return {"verdict": "held" if answer["held"] else "failed", "answer": answer}
+
+
+_kept: dict[str, dict[str, Any]] = {}  # answers that will be asked for: by what the file asks for, as JSON
+
+
+def _sample(
+    files: dict[str, str], g: Group, quantities: list[Varied], asked: dict[str, Any], beside: Sequence[str]
+) -> dict[str, Any]:
+    """The answer to a sample: from lanes, where they can run it."""
+    key = json.dumps([files, asked], sort_keys=True)
+    if key not in _kept:
+        _kept.clear()
+        all_asked = {key: asked}
+        for other in beside:
+            with suppress(InputError, OSError):  # asked for, it is told
+                next_one = _asked(other)
+                if next_one["group"] == asked["group"] and "search" not in next_one:
+                    all_asked[json.dumps([files, next_one], sort_keys=True)] = next_one
+        found = in_lanes(files, g, quantities, [a["point"] for a in all_asked.values()])
+        for name, one, margins in zip(all_asked, all_asked.values(), found, strict=True):
+            _kept[name] = {"alone": margins.why} if isinstance(margins, Alone) else _in_lanes(margins, one["point"])
+    answer = _kept.pop(key)
+    if answer["alone"]:
+        return {**trial_once(files, g, quantities, asked["point"]), **answer}
+    return answer
+
+
+def _in_lanes(margins: list[Margin], point: list[float]) -> dict[str, Any]:
+    """The answer of a machine that ran in lanes: it has no digest, and nothing was seen but its margins."""
+    held = all(m.held for m in margins)
+    return {"point": point, "held": held, "margins": _rows(margins), "state_hash": None, "seen": [], "alone": ""}
 
 
 class _Margin(BaseModel):
@@ -58,9 +97,10 @@ class _Answer(BaseModel):
     point: list[Finite]
     held: bool
     margins: list[_Margin]
-    state_hash: str | None  # None: the controller did not run to the end
+    state_hash: str | None  # None: the controller did not run to the end, or it ran in lanes
     seen: list[str]
     runs: int = 0
+    alone: str | None = None  # why it did not run in lanes; empty: it did
 
 
 class _Asked(Table):
@@ -96,9 +136,8 @@ def _asked(path: str) -> dict[str, Any]:
 
 def model_at(files: dict[str, str], g: Group, quantities: list[Varied], point: list[float]) -> Model:
     """The model file of a point of the unit cube."""
-    values = [q.low + u * (q.high - q.low) for q, u in zip(quantities, point, strict=True)]
     base = base_model(files, group_machine(files, g, Model()).plant) if "model" in files else None
-    return model_of(quantities, values, base)
+    return model_of(quantities, values_at(quantities, point), base)
 
 
 def trial_once(files: dict[str, str], g: Group, quantities: list[Varied], point: list[float]) -> dict[str, Any]:
@@ -113,15 +152,17 @@ def trial_once(files: dict[str, str], g: Group, quantities: list[Varied], point:
 
 
 def _answer(scenario: Scenario, outcome: Outcome, point: list[float]) -> dict[str, Any]:
-    found = margins(scenario, outcome)
-    rows = [
+    return {
+        "point": [float(u) for u in point], "held": outcome.held, "margins": _rows(margins(scenario, outcome)),
+        "state_hash": outcome.state_hash, "seen": [c.seen for c in outcome.checks if c.held is False],
+    }  # fmt: skip
+
+
+def _rows(found: Iterable[Margin]) -> list[dict[str, Any]]:
+    return [
         {"expected": m.expected, "held": m.held, "value": None if np.isnan(m.value) else m.value, "unit": m.unit,
          "share": None if np.isnan(m.share) else m.share} for m in found
     ]  # fmt: skip
-    return {
-        "point": [float(u) for u in point], "held": outcome.held, "margins": rows, "state_hash": outcome.state_hash,
-        "seen": [c.seen for c in outcome.checks if c.held is False],
-    }  # fmt: skip
 
 
 def moving(answers: Iterable[dict[str, Any]]) -> list[str]:
@@ -207,6 +248,7 @@ def _warm_up(options: dict[str, Any], run_folder: str) -> None:
     """Compile what a scenario needs."""
     warm_up(lambda text: None)
     run(Scenario(title="warm-up", duration=0.1))
+    warm_up_lanes()
 
 
 run_trial.warm_up = _warm_up  # type: ignore[attr-defined]

@@ -100,11 +100,11 @@ class _Worker:
             return
         self.journal.note("took", chunk=chunk, lease=number)
         try:
-            for e in entries:
+            for i, e in enumerate(entries):
                 if self.me.stopped.is_set() or not self.leases.mine(chunk, number):
                     return
                 if self.folder.result(chunk, e.key) is None:
-                    self._log(chunk, e)
+                    self._log(chunk, e, [other.path for other in entries[i + 1 :]])
             self.folder.close(chunk, entries)
         except FileNotFoundError:  # who stood still long enough may find that another has finished, and cleared up
             if chunk not in self.folder.finished() and self.leases.mine(chunk, number):
@@ -114,7 +114,7 @@ class _Worker:
             self.leases.give_back(chunk, number)
         self.journal.note("closed", chunk=chunk)
 
-    def _log(self, chunk: str, e: Entry) -> None:
+    def _log(self, chunk: str, e: Entry, beside: Sequence[str]) -> None:
         tried = self.folder.results(chunk) / f"{e.key}.tried"
         row: dict[str, Any] | None = None
         while row is None:
@@ -128,7 +128,7 @@ class _Worker:
                 _append(tried, "begin")
                 self.journal.note("begin", key=e.key, path=e.path)
                 passed("begin")
-                row = self._read(e, tried, before)
+                row = self._read(e, tried, before, beside)
             if row is None and self.me.stopped.is_set():  # an answer that has come is kept all the same
                 return
         whole_json(self.folder.results(chunk) / f"{e.key}.json", {"key": e.key, **row})
@@ -137,12 +137,12 @@ class _Worker:
         self.counts[row["status"]] = self.counts.get(row["status"], 0) + 1
         self.journal.note("end", key=e.key, status=row["status"])
 
-    def _read(self, e: Entry, tried: Path, before: Sequence[str]) -> dict[str, Any] | None:
-        """What comes of a log now; None: to be tried again."""
+    def _read(self, e: Entry, tried: Path, before: Sequence[str], beside: Sequence[str]) -> dict[str, Any] | None:
+        """What comes of a log now; None: to be tried again. After a failure it is tried without those ``beside``."""
         if (bad := _unlike(e)) is not None:
             return bad
         try:
-            row = self.reader.ask(e.path, self.folder.job["options"], self.limit)
+            row = self.reader.ask(e.path, self.folder.job["options"], self.limit, () if before else beside)
         except Stopped:
             return None
         except Died as why:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,7 @@ class GroupView:
     by_search, runs        whether the search found it, and the search's runs
     same                   whether the saved case ran to the same bits
     first, total           sensitivity indices of the least margin; empty: none
+    alone                  samples that ran on the lockstep bus and not in lanes, by the reason
     """
 
     name: str
@@ -78,6 +79,7 @@ class GroupView:
     same: bool
     first: list[float]
     total: list[float]
+    alone: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -164,6 +166,8 @@ def _group(page: Page, view: CampaignView, g: GroupView) -> None:
                "margin after search"]  # fmt: skip
     page.table(columns, [[r.expected, not r.fails, r.trials, r.broken, r.least, r.median, r.unit or "–", r.searched]
                          for r in g.requirements])  # fmt: skip
+    for why, n in g.alone.items():
+        page.text(f"{n} of {g.trials} machines ran one by one on the lockstep bus, not in lanes: {why}.")
     names = [q["name"] for q in view.varied]
     if g.total:
         total, first = np.round(g.total, 3).tolist(), np.round(g.first, 3).tolist()
