@@ -33,7 +33,7 @@ from vaneloop.fleet.report import YEAR, limits_of, view_of, whole_of, write_page
 from vaneloop.fleet.sources import moment
 from vaneloop.fleet.tables import TABLES, answers, roll_up, write_tables
 from vaneloop.fleet.trends import Trend, limit_of, odd, trend
-from vaneloop.pages.fleet import FleetView, _digits, fleet_page
+from vaneloop.pages.fleet import FleetView, fleet_page
 
 BEGIN = moment("2026-01-01") or 0.0
 NOMINAL = [f"linkage.vgv{k}_{what}" for k in range(5) for what in ("play", "lc", "l", "bias")]
@@ -388,14 +388,6 @@ def test_the_page_leads_to_the_logs_own_pages(folder: Folder, view: FleetView, t
     assert "supply_dip" in page and "no limit is given" in page and view.sentence() in page
     open_to_all(tmp_path / sorted(links)[0], "fleet-log")
     open_to_all(tmp_path / "fleet.html", "fleet")
-
-
-@pytest.mark.parametrize(
-    ("value", "width", "said"),
-    [(1.65012, 2e-4, "1.65012"), (1.03123, 0.014, "1.031"), (0.5, 0.6, "0.5"), (0.0, 1.0, "0")],
-)
-def test_a_number_has_the_digits_that_its_interval_is_worth(value: float, width: float, said: str) -> None:
-    assert f"{value:.{_digits(value, width)}g}" == said
 
 
 def test_tables_of_two_reports_are_the_same_bytes(folder: Folder, tmp_path: Path) -> None:

@@ -55,7 +55,8 @@ def test_formats_that_share_a_suffix_are_told_by_their_beginning_and_none_begins
 def test_what_is_written_begins_as_its_format_and_is_told_by_that(suffix: str, tmp_path: Path) -> None:
     write_log(tmp_path / f"a{suffix}", {"n_dem": Channel(T, SPEED)})
     file = (tmp_path / f"a{suffix}").rename(tmp_path / "a.bin")
-    with pytest.raises(LogError, match=rf"suffix '\.bin' is not a log's; .*; it begins as .* does \(\{suffix}\)$"):
+    first = FORMATS[suffix].suffixes[0]
+    with pytest.raises(LogError, match=rf"suffix '\.bin' is not a log's; .*; it begins as .* does \(\{first}\)$"):
         read_log(file)
 
 

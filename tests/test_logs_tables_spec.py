@@ -604,7 +604,7 @@ def test_wild_samples_are_left_out_and_the_furthest_is_named(tmp_path: Path) -> 
     assert read(mode).notes == ["state (state): 1 of 20 samples are outside 0 to 4 (furthest 9): left out"]
     with pytest.raises(LogError, match="LOG: x_dem"):
         Log("LOG", {"x_dem": Channel(np.arange(2.0), np.array([900.0, 900.0]))})
-    with pytest.raises(LogError, match="spans 30,000 s with 2 rows; .* --unit t=ms, if time counts in ms"):
+    with pytest.raises(LogError, match="spans 30,000 s with 2 rows; .* --unit t=us, if time counts in us"):
         Log("LOG", {"x_dem": Channel(np.array([0.0, 3e4]), np.ones(2))})
     Log("LOG", {"x_dem": Channel(np.arange(2.0), np.array([900.0, 900.0]))}, signals={"x_dem": "N"})
 
@@ -652,7 +652,7 @@ def test_a_time_far_from_zero_is_counted_from_the_start(tmp_path: Path) -> None:
     excel = csv(tmp_path, "t,n_dem\n45000.0,50\n45000.00001157407,51\n")
     log = read(excel)
     assert any(n.startswith("time counts from 1900: ") for n in log.notes)
-    assert "time (=1.05e+11 s) must be below 1e+10 s; --unit t=ms, if it is in ms" in refused(
+    assert "time (=1.05e+11 s) must be below 1e+10 s; --unit t=ns, if it is in ns" in refused(
         csv(tmp_path, "t,n_dem\n1e11,1\n1.1e11,2\n"), guess=False
     )
     jump = (
@@ -709,7 +709,7 @@ def test_a_suffix_that_is_no_log_s_is_refused(tmp_path: Path) -> None:
     for act in (read, lambda p: write_log(p, {"n_dem": Channel(np.zeros(1), np.zeros(1))}), offered):
         with pytest.raises(
             LogError,
-            match=r"suffix '.txt' is not a log's; allowed: .log, .asc, .blf, .trc, .mf4, .dat, .mdf, "
+            match=r"suffix '.txt' is not a log's; allowed: .log, .can, .crtd, .crt, .asc, .blf, .trc, .mf4, .dat, .mdf, "
             r".csv, .msl, .lvm, .parquet",
         ):
             act(tmp_path / "a.txt")

@@ -24,7 +24,7 @@ from hil.bus.port import Port, open_bus
 from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
 from hil.calibrate.master import Master
 from hil.calibrate.station import MASTER, SLAVE, data_of, row_of
-from hil.inject import actions, injection
+from hil.inject import actions, on_lockstep
 from hil.inject.injection import run
 from hil.inject.scenario import load_scenario
 from hil.inject.tamper import Gateway, Intruder
@@ -166,17 +166,17 @@ class _Injected:
         moved = [a.model_copy(update={"start": k * 1e-3 + a.start - first}) for a in scenario.inject]
         chance = random.Random(scenario.seed)
         for who in self.gateways:
-            mine = [a for a in moved if isinstance(a, actions.OnFrame) and injection.sender_of(a) == who]
+            mine = [a for a in moved if isinstance(a, actions.OnFrame) and on_lockstep.sender_of(a) == who]
             if mine:
                 self.gateways[who].append(Gateway(mine, chance))
         for a in moved:
             if isinstance(a, actions.Outsider):
                 self.intruders.append((self.channel.join(), Intruder(a, chance, self.recorded)))
             elif isinstance(a, actions.Machine):
-                self.machines.append(injection.MachineChange(a, self.node, self.ecu))
+                self.machines.append(on_lockstep.MachineChange(a, self.node, self.ecu))
         on_bus = [a for a in moved if isinstance(a, actions.OnBus)]
         if on_bus:
-            self.disturbers.append(injection.Disturber(on_bus, self.channel.wire, self.places))
+            self.disturbers.append(on_lockstep.Disturber(on_bus, self.channel.wire, self.places))
         self.end = max(self.end, *(min(a.end, k * 1e-3 + scenario.duration - first) for a in moved), 0.0)
 
     def news(self) -> list[tuple[float, str]]:
