@@ -709,8 +709,8 @@ def test_a_suffix_that_is_no_log_s_is_refused(tmp_path: Path) -> None:
     for act in (read, lambda p: write_log(p, {"n_dem": Channel(np.zeros(1), np.zeros(1))}), offered):
         with pytest.raises(
             LogError,
-            match=r"suffix '.txt' is not a log's; allowed: .log, .can, .crtd, .crt, .asc, .blf, .trc, .mf4, .dat, .mdf, "
-            r".csv, .msl, .lvm, .parquet",
+            match=r"suffix '.txt' is not a log's; allowed: .log, .can, .crtd, .crt, .asc, .blf, .trc, .mf4, .dat, "
+            r".mdf, .csv, .msl, .lvm, .parquet",
         ):
             act(tmp_path / "a.txt")
     assert values(csv(tmp_path, f"t,n_dem\n{ROWS}", "A.CSV")) == [50, 51, 52]

@@ -54,7 +54,7 @@ unlike its fleet peers), 2 bad input"""
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the parts of the command and their options."""
-    parts = parser.add_subparsers(dest="part", metavar="PART", required=True, parser_class=terminal.Parser)
+    parts = parser.add_subparsers(dest="verb", metavar="PART", required=True, parser_class=terminal.Parser)
     run = parts.add_parser("run", help="take up the logs and diagnose them")
     run.add_argument("logs", nargs="+", metavar="LOGS", help="logs, and folders that hold logs at any depth")
     run.add_argument("--out", required=True, metavar="RUN", help="folder of the run; one that is there is gone on with")
@@ -97,7 +97,7 @@ def command(args: argparse.Namespace) -> int:
     needs("vaneloop fleet", "psutil", "duckdb", "ruptures")
     parts = {"run": _run, "work": _work, "status": _status, "report": _report}
     with unusable():
-        return parts[args.part](args)
+        return parts[args.verb](args)
 
 
 @contextmanager
@@ -225,7 +225,7 @@ def _patience(args: argparse.Namespace) -> float:
 
 def _show(args: argparse.Namespace) -> int:
     """Print how far the run is."""
-    folder = Folder(args.run if args.part != "run" else args.out)
+    folder = Folder(args.run if args.verb != "run" else args.out)
     s = state_of(folder)
     rows = [[status, f"{n:,}"] for status, n in s.came.items()]
     terminal.print_table(args, f"{s.done:,} of {s.contents:,} contents done ({s.logs:,} logs)", ["came to", "n"], rows)
