@@ -144,7 +144,7 @@ def system(**more: Any) -> System:
 def test_a_log_of_a_system_is_on_the_raster_of_its_output_with_most_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     slow, fine = np.arange(6) * 0.2, np.arange(21) * 0.05
     gap = fine[(fine < 0.3) | (fine > 0.62)]
-    log = SimpleNamespace(notes=["read"], channels={
+    log = SimpleNamespace(path="logs/r.csv", notes=["read"], channels={
         "u": Channel(slow, slow, framed=True), "y": Channel(fine, fine**2), "z": Channel(gap, 2.0 * gap),
         "one": Channel(np.array([0.5]), np.array([3.0])),
     })  # fmt: skip
@@ -639,7 +639,7 @@ class Learning:
         self.found: Any = SimpleNamespace(diagnosis=SimpleNamespace(stages=found), effects=["valve_lag"])
         self.chain: Any = SimpleNamespace(
             stage=lambda name: next(s for s in self.stages if s.name == name), test=None, steps={"x_lvdt": 0.1},
-            stages=self.stages,
+            stages=self.stages, start=0.0,
         )  # fmt: skip
 
     def learned(self, **more: Any) -> Any:
