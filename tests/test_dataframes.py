@@ -359,6 +359,7 @@ def test_a_learned_law_has_its_curve_in_the_answer() -> None:
     answer = vaneloop.learn(frame, system())
     law = answer.laws[0]
     assert answer.verdict == "learned" and any(e.effect == law.name for e in answer.params.values())
+    assert "gain" in answer.params  # that of the model with its law, and no other beside it
     assert (
         answer.to_frame().loc[0, "effect"] == law.name
         and answer.plot(figure.subplots()).lines[0].get_label() == law.name

@@ -1,15 +1,16 @@
 """VaneLoop: compare an engine-controller and its variable guide vanes with measurements, and find what the model lacks.
 
-The names below are the public interface, for notebooks and tests of your own; each is imported when it is first used::
+The names below are the public interface, for notebooks and tests of your own; each is imported when it is first used.
 
-    import vaneloop
-    log = vaneloop.read_log("examples/hidden_effect.parquet")
-    answer = vaneloop.diagnose(log)  # Machine(...) or a System of your own as second argument
-    print(answer)  # one sentence; in a notebook the cell shows the page
-    answer.to_dict()["effects"], answer.plot(), answer.report("diagnosis.html")
-    better = vaneloop.extend(log, answer.effects)
-    better.write("better.toml")
+>>> import vaneloop
+>>> log = vaneloop.read_log("examples/hidden_effect.parquet")[0:60]  # or a pandas.DataFrame
+>>> print(vaneloop.compare(log))  # Machine(...) or a System of your own as second argument
+The model fails most in the actuator subsystem: x_lvdt is off by 0.652 mm RMS, 130 times its noise floor.
+>>> better = vaneloop.extend(log, ["valve_dead_band", "aero_load"])  # as vaneloop.diagnose(log) names them
+>>> better.verdict, better.params["aero_load.force"].unit, better.residuals.units
+('explained', 'N', {'x_lvdt': 'mm'})
 
+`answer.report("page.html")` writes the page, `answer.plot()` draws, `better.write("better.toml")` writes the model.
 Every verb (`replay`, `compare`, `locate`, `diagnose`, `extend`, `experiment`, `learn`) returns such an answer.
 """
 

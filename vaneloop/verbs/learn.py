@@ -126,7 +126,8 @@ class Learned(Answer):
         ]  # fmt: skip
 
     def _fits(self) -> Sequence[Fitted]:
-        return self.fits or self.diagnosed._fits()
+        learned = {f.judge.stage.name for f in self.fits}
+        return [*self.fits, *(f for f in self.diagnosed._fits() if f.judge.stage.name not in learned)]
 
     def _worked_out(self) -> Curves:
         if self.by_log is None:

@@ -155,7 +155,7 @@ def read_record(log: LogLike, system: System, **reading: Any) -> tuple[Record, l
             i = np.clip(np.searchsorted(channel.t, t), 1, len(channel.t) - 1)
             v[np.minimum(np.abs(channel.t[i] - t), np.abs(t - channel.t[i - 1])) > 1.5 * step] = np.nan
         columns[c] = v
-    name = Path(read.path).name
+    name = Path(log if isinstance(log, str | Path) else read.path).name
     return Record(name, t, columns), [f"{name}: {note}" for note in read.notes]
 
 
