@@ -17,8 +17,10 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+from hil.figures import noise_floor
 from hil.logs import Log, LogError, read_log
 from hil.logs.guess import mean_stroke
+from hil.logs.joined import joined
 from hil.logs.notes import Note, counted
 from hil.logs.plausible import judge
 from hil.logs.survey import survey
@@ -371,3 +373,47 @@ def test_channels_of_mdf_3_are_those_that_asammdf_reads(tmp_path: Path, columns:
 def read_log_text(folder: Path, text: str) -> Log:
     (folder / "a.csv").write_text(text)
     return read_log(folder / "a.csv", require=("n_dem",))
+
+
+# ---- samples that nobody took ----------------------------------------------------------------------------------------
+
+
+@given(
+    st.integers(0, 999),
+    st.integers(2, 10),
+    st.sampled_from([3, 4, None]),
+    st.floats(0.005, 0.2),
+    st.sampled_from(["sine", "dwells"]),
+)
+@TWICE
+def test_samples_joined_by_straight_lines_are_taken_at_their_own_rate(
+    tmp_path: Path, seed: int, every: int, digits: int | None, noise: float, how: str
+) -> None:
+    rng, n = np.random.default_rng(seed), 500
+    t = np.arange(n) * 0.01 * every
+    speed = 70.0 + (8.0 * np.sin(t / 3.0) if how == "sine" else 5.0 * np.round(np.sin(t / 7.0)))
+    speed = speed + noise * rng.standard_normal(n)
+    fine = np.arange((n - 1) * every + 1) * 0.01
+    values = np.interp(fine, t, speed)
+    values = values if digits is None else np.round(values, digits)
+    rows = "".join(f"{a:.2f},{float(v)!r}\n" for a, v in zip(fine, values, strict=True))
+    log = read(tmp_path, "t,n_r\n" + rows)
+    c = log.channels["n_r"]
+    assert c.t == pytest.approx(t) and c.values.tolist() == values[::every].tolist()
+    assert c.apart == pytest.approx(0.01 * every)
+    assert noise_floor(c.t, c.values) == pytest.approx(noise, rel=0.35, abs=1e-3)
+
+
+@given(
+    st.integers(0, 999), st.floats(0.0, 0.2), st.integers(1, 4), st.sampled_from(["sine", "program", "held", "noise"])
+)
+@TWICE
+def test_a_channel_that_was_sampled_in_each_row_is_left_alone(seed: int, noise: float, digits: int, how: str) -> None:
+    rng, t = np.random.default_rng(seed), np.arange(3000) * 0.01
+    values = {
+        "sine": 70.0 + 8.0 * np.sin(t),
+        "program": np.interp(t, np.arange(0.0, 31.0), rng.uniform(50.0, 90.0, 31)),  # corners at whole seconds
+        "held": np.repeat(rng.uniform(50.0, 90.0, 600), 5),
+    }[how]
+    found = joined(t, np.round(values + noise * rng.standard_normal(3000), digits))
+    assert found is None or not found.sure

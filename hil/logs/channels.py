@@ -58,12 +58,15 @@ class Channel:
         It came in the frames of a bus: a value holds from its frame on. Else it was polled, sampled or resampled.
     unit : str
         Of the values; "": not known.
+    apart : float
+        s from one true sample to the next, where an exporter joined them by straight lines; 0: each is one.
     """
 
     t: np.ndarray
     values: np.ndarray
     framed: bool = False
     unit: str = ""
+    apart: float = 0.0
 
     def __len__(self) -> int:
         """How many samples there are."""

@@ -22,6 +22,8 @@ from hil.logs.channels import Channels
 from hil.logs.dataframe import frame_columns, is_frame, name_of, open_frame
 from hil.logs.formats import format_at
 from hil.logs.guess import Files, Guess
+from hil.logs.joined import joined
+from hil.logs.notes import Note
 from hil.logs.opening import Opened, is_ours, open_log, sketch, wanted_design_speed
 from hil.logs.scale import proposed_scale
 from hil.logs.source import ABSENT, Channel, LogError, Options, Series, Source, close_names, find, is_absent
@@ -389,7 +391,7 @@ def read_log(
             line = f"{path}: {found} {signal}: {asked}; --map NAME={signal} names another{source.has()}"
             raise LogError("; ".join(filter(None, (line, log.unused))))
     _refuse_units(path, wrong)
-    channels = _one_run(path, channels, require, notes)
+    channels = _own_samples(_one_run(path, channels, require, notes), notes)
     _shift(channels, notes, "1900" if units.get("t") == "day" else "1970")
     ours = {name: (c.t, c.values) for name, c in channels.items() if is_ours(name, signals)}
     sure, perhaps = plausible.too_small(ours, set(units) - set(log.guesses.made))
@@ -466,6 +468,30 @@ def _one_run(
             out[name] = replace(c, t=c.t[use], values=c.values[use])
         if name in require and np.count_nonzero(use) < 2:
             raise LogError(f"{path}: no {name} in the part of the log that is kept ({note})")
+    return out
+
+
+def _own_samples(channels: dict[str, Channel], notes: list[str]) -> dict[str, Channel]:
+    """Channels at the rate at which they were sampled, where an exporter joined their samples by straight lines; a
+    command that seldom bends keeps its lines, but says how far its samples are apart.
+    """
+    found = {name: j for name, c in channels.items() if not c.framed and (j := joined(c.t, c.values)) is not None}
+    if not any(j.sure for j in found.values()):
+        return channels
+    out = dict(channels)
+    for name, j in found.items():
+        c = channels[name]
+        step = float(np.median(np.diff(c.t)))
+        apart = j.every * step
+        said = f"{name}: samples {apart:.3g} s apart are joined by straight lines"
+        if j.sure:
+            true = np.rint((c.t - c.t[0]) / step).astype(np.int64) % j.every == j.first
+            notes.append(Note(f"{said}: only these are taken, {np.count_nonzero(true):,} of {true.size:,}", "left out",
+                              name, np.count_nonzero(~true)))  # fmt: skip
+            out[name] = replace(c, t=c.t[true], values=c.values[true], apart=apart)
+        elif j.every > 2:
+            notes.append(Note(f"{said}", "filled", name, c.t.size - c.t.size // j.every))
+            out[name] = replace(c, apart=apart)
     return out
 
 

@@ -235,6 +235,17 @@ def build_chain(
             coarse = make(driven.at(slice(None, None, 2), every_other(have), rows[::2]))
             more = rms(coarse, stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0])
             stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
+        _at_own_rate(stage, outputs, log, grid)
+        if (apart := max(round(log.channels[c].apart / dt) for c in needs)) > 1:
+            more = np.zeros(len(outputs))
+            own, late = np.arange(0, len(t), 2 * apart), np.minimum(np.arange(len(t)) + apart // 2, len(t) - 1)
+            slow = [c for c in needs if log.channels[c].apart > 1.5 * dt]
+            # what half of the true samples cost, or half the time between two, is more than what the lines do
+            for other in ({c: np.interp(t, t[own], have[c][own]) for c in slow}, {c: have[c][late] for c in slow}):
+                varied = make(driven._replace(columns=have | other))
+                change = stage.run(stage.neutral()[None])[0] - varied.run(varied.neutral()[None])[0]
+                more = np.maximum(more, rms(stage, change))
+            stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
         least = LEAST_FLOOR[name]
         if bits and "x_lvdt" in (*needs, *gives):
             stage.coarse = {"x_lvdt": bits}
@@ -255,6 +266,19 @@ def _never_changes(values: Array) -> bool:
     """Whether all values are the same to the last bit: a sensor's noise would change them."""
     known = values[np.isfinite(values)]
     return bool(np.all(known == known[:1]))
+
+
+def _at_own_rate(stage: Stage, outputs: tuple[str, ...], log: Log, grid: Grid) -> None:
+    """Count an output whose samples were joined by straight lines at its samples only: noise between them is not its
+    own.
+    """
+    for k, name in enumerate(outputs):
+        c = log.channels[name]
+        if c.apart > 1.5 * grid.dt:
+            when = stage.t + grid.start
+            i = np.clip(np.searchsorted(c.t, when), 1, len(c.t) - 1)
+            away = np.minimum(np.abs(c.t[i] - when), np.abs(when - c.t[i - 1]))
+            stage.measured[k, away > 0.3 * grid.dt] = np.nan
 
 
 def _lost_step(log: Log, machine: Plant) -> float:
