@@ -27,6 +27,7 @@ from hil.logs.survey import survey
 from hil.logs.units import Units, scale_of
 from plant.geometry import load_schedules
 from tests.conftest import examples
+from vaneloop.identification.user_models.data import noise_of_neighbours, without_order
 
 SIGNALS = ("n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd")
 TWICE = settings(max_examples=examples(60), suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -417,3 +418,20 @@ def test_a_channel_that_was_sampled_in_each_row_is_left_alone(seed: int, noise: 
     }[how]
     found = joined(t, np.round(values + noise * rng.standard_normal(3000), digits))
     assert found is None or not found.sure
+
+
+# ---- noise of rows in no order ---------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 999), st.floats(0.01, 0.5), st.integers(1, 2), st.booleans())
+@settings(max_examples=examples(25))
+def test_the_noise_of_a_static_model_does_not_turn_on_the_order_of_its_rows(
+    seed: int, noise: float, inputs: int, shuffled: bool
+) -> None:
+    rng, n = np.random.default_rng(seed), 2000
+    u = rng.uniform(-1.0, 1.0, (inputs, n)) if shuffled else np.sort(rng.uniform(-1.0, 1.0, (inputs, n)), axis=1)
+    y = 10.0 * np.sin(2.0 * u[0]) + 3.0 * u[-1] ** 2 + noise * rng.standard_normal(n)
+    assert without_order(u) == shuffled
+    assert noise_of_neighbours(u, y) == pytest.approx(noise, rel=0.15, abs=0.02)
+    again = rng.permutation(n)
+    assert noise_of_neighbours(u[:, again], y[again]) == pytest.approx(noise_of_neighbours(u, y), rel=0.1)

@@ -23,7 +23,7 @@ from hil.logs.dataframe import frame_columns, is_frame, name_of, open_frame
 from hil.logs.formats import format_at
 from hil.logs.guess import Files, Guess
 from hil.logs.joined import joined
-from hil.logs.notes import Note
+from hil.logs.notes import MOST_ROWS, Note
 from hil.logs.opening import Opened, is_ours, open_log, sketch, wanted_design_speed
 from hil.logs.scale import proposed_scale
 from hil.logs.source import ABSENT, Channel, LogError, Options, Series, Source, close_names, find, is_absent
@@ -210,9 +210,9 @@ def _in_time(s: Series, t: np.ndarray, known: dict[int, np.ndarray], notes: list
         if known[id(s.t)].size:
             first = int(known[id(s.t)][0])
             what = f"{known[id(s.t)].size:,} of {rows.size:,} {s.word}s"
-            notes.append(
-                f"time: {what} have a wrong time stamp (first {s.word} {first + s.first}: {t[first]:.9g} s): left out"
-            )
+            where = f"first {s.word} {first + s.first}: {t[first]:.9g} s"
+            said = f"time: {what} have a wrong time stamp ({where}): left out"
+            notes.append(Note(said, "left out", "time", known[id(s.t)].size, known[id(s.t)][:MOST_ROWS] + s.first))
     bad = known[id(s.t)]
     there = np.isfinite(s.values)
     if not bad.size or 2 * np.count_nonzero(there[bad]) > np.count_nonzero(
@@ -231,7 +231,9 @@ def _clean(path: Path, signal: str, key: str, s: Series, in_order: bool, notes: 
     if not finite.all():
         lost = int(np.count_nonzero(~finite & ~(is_absent(values) | is_absent(t))))
         if lost:
-            notes.append(f"{signal} ({key}): {lost} of {t.size} samples are NaN or infinite: left out")
+            rows = np.flatnonzero(~finite & ~(is_absent(values) | is_absent(t))) + s.first
+            said = f"{signal} ({key}): {lost} of {t.size} samples are NaN or infinite: left out"
+            notes.append(Note(said, "left out", signal, lost, rows))
         t, values = t[finite], values[finite]
     if not in_order and t.size:
         back = np.flatnonzero(np.diff(t) < 0)
@@ -249,10 +251,9 @@ def _clean(path: Path, signal: str, key: str, s: Series, in_order: bool, notes: 
                 f"the next: the times need more digits, or --map NAME=t names another time"
             )
         if not last.all():
-            notes.append(
-                f"{signal} ({key}): {int(np.count_nonzero(~last))} of {t.size} samples have the time of the next: "
-                f"left out"
-            )
+            twice = np.flatnonzero(finite)[~last] + s.first
+            said = f"{signal} ({key}): {twice.size} of {t.size} samples have the time of the next: left out"
+            notes.append(Note(said, "left out", signal, twice.size, twice[:MOST_ROWS]))
             t, values = t[last], values[last]
     if not t.size:
         if s.t.size:
@@ -445,7 +446,7 @@ def _inside(
     what = (
         f"{far.size:,} of {inside.size:,} samples are outside {r.low:g} to {r.high:g}{unit} (furthest {furthest:.6g})"
     )
-    notes.append(f"{signal} ({key}): {what}: left out")
+    notes.append(Note(f"{signal} ({key}): {what}: left out", "left out", signal, far.size))
     return replace(c, t=c.t[inside], values=c.values[inside])
 
 
@@ -460,7 +461,8 @@ def _one_run(
         raise LogError(f"{path}: {why}")
     if not note:
         return channels
-    notes.append(note)
+    lost = max(int(np.count_nonzero((c.t < first) | (c.t > last))) for c in channels.values())
+    notes.append(Note(note, "left out", "time", lost))
     out = {}
     for name, c in channels.items():
         use = (c.t >= first) & (c.t <= last)

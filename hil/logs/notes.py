@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-__all__ = ["Note", "counted"]
+__all__ = ["MOST_ROWS", "Note", "counted"]
 
 MOST_ROWS = 20  # that a note lists; it counts all
 

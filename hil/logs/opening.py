@@ -16,6 +16,7 @@ from hil.logs.guess import Files, Guess, Guesses, design_speed, withdrawn
 from hil.logs.guess import guess as guess_names
 from hil.logs.mapping import Bench, read_mapping
 from hil.logs.names import CERTAIN, unit_behind, unit_in_name, unit_kind
+from hil.logs.notes import Note
 from hil.logs.source import LogError, Options, Source, close_names, find
 from hil.logs.table import Table
 from hil.logs.times import guess_unit
@@ -170,7 +171,7 @@ def open_log(
     for signal, g in out.guesses.made.items():
         named[signal] = g.name
         out.units.setdefault(signal, g.unit)
-        notes.append(g.note())
+        notes.append(Note(g.note(), "guessed", signal, 1))
     return out
 
 

@@ -18,6 +18,7 @@ from controller import load_calibration
 from hil.figures import error_figures
 from hil.logs import LogError
 from hil.logs.held import ANSWERS, COMMANDS, SAME, answers, held, phase_of_ticks, taken
+from hil.logs.notes import Note, counted
 from hil.loop.lockstep import FRAME, Stimulus, lockstep
 from plant import build_plant
 from vaneloop.base.signals import UNITS
@@ -176,7 +177,9 @@ def _driven(log: Log, notes: list[str]) -> tuple[dict[str, Channel], float]:
     begin = first[last]
     before = begin - min(float(c.t[0]) for c in log.channels.values())
     if before > 0.5:
-        notes.append(f"the first {before:.4g} s of the log are before {last} begins: not simulated, not compared")
+        said = f"the first {before:.4g} s of the log are before {last} begins: not simulated, not compared"
+        rows = max(int(np.count_nonzero(c.t < begin)) for c in log.channels.values())
+        notes.append(Note(said, "left out", "time", rows))
     same: dict[int, np.ndarray] = {}  # channels of a table share their time
     return {n: replace(c, t=same.setdefault(id(c.t), c.t - begin)) for n, c in log.channels.items()}, begin
 
@@ -225,4 +228,5 @@ def replay_json(result: ReplayResult) -> dict[str, Any]:
         "state_hash": result.state_hash,
         "signals": [asdict(s) for s in result.signals],
         "notes": result.notes,
+        "done": counted(result.notes),
     }

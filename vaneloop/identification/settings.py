@@ -1131,6 +1131,22 @@ SPLINE_MEMORY = setting(
     "A derivative by splines forgets the end of a log after so many.",
     "principle: 0.27^8 of the error there is left",
 )
+UNORDERED = setting(
+    1.0,
+    "variances",
+    "Rows of a static model stand in no order where each input's mean squared step from row to row is more than this.",
+    "textbook: von Neumann's ratio is 2 for rows in random order, near 0 for a run",
+)
+MOST_PLANES = setting(
+    1000,
+    "rows",
+    "The noise of rows in no order is told from planes through so many of them and their neighbours.",
+    "speed: the median of so many is known to 2 %",
+)
+PLANE_FREE = setting(
+    5, "rows", "A plane through a row and its neighbours has so many more rows than it has parameters.",
+    "judgement: the fewer, the nearer they are",
+)
 LONGEST_SPIKE = setting(
     3, "samples", "A spike lasts no longer than this.", "judgement: what stays away for longer is no spike"
 )

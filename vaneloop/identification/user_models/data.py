@@ -16,12 +16,15 @@ from vaneloop.identification.settings import (
     EDGE_PERIODS,
     INPUT_JUMP,
     LONGEST_SPIKE,
+    MOST_PLANES,
     MOVES,
+    PLANE_FREE,
     SPIKE_ANSWERS,
     SPIKE_BACK,
     SPIKE_FAR,
     SPIKE_SHARE,
     SPLINE_MEMORY,
+    UNORDERED,
 )
 from vaneloop.identification.subsystem import Array, StageError
 from vaneloop.identification.user_models.exogenous_regressors import column_of
@@ -36,7 +39,7 @@ from vaneloop.identification.user_models.motion import (
 )
 from vaneloop.identification.user_models.system import Record, System
 
-__all__ = ["Data", "noise_of_channel", "spikes"]
+__all__ = ["Data", "noise_of_channel", "noise_of_neighbours", "spikes", "without_order"]
 
 
 class Data:
@@ -257,6 +260,8 @@ class Data:
         for name, y in zip(self.system.outputs, self.measured, strict=True):
             good = y[np.isfinite(y)]
             level = noise_of_channel(good)
+            if self.system.kind == "static" and (u := np.concatenate(self.u, axis=1)).size and without_order(u):
+                level = noise_of_neighbours(u[:, np.isfinite(y)], good)
             if self.cutoff:  # what the low-pass leaves of the noise in the force as it was logged
                 raw = [r.columns[name] for r in self.records]
                 rate = 1.0 / float(np.median(np.diff(self.records[0].t)))
@@ -303,6 +308,32 @@ def noise_of_channel(y: Array) -> float:
     if len(y) < 40:
         return 0.0
     return min(level / white for level, white in zip(_quiet(y), _of_white(len(y)), strict=True))
+
+
+def without_order(u: Array) -> bool:
+    """Whether rows of inputs float64[inputs, rows] stand in no order: each input changes from row to row as much as
+    between any two rows (von Neumann's ratio, 2 for white noise, near 0 for a run).
+    """
+    varied = u[np.std(u, axis=1) > 0.0]
+    steps = np.mean(np.diff(varied, axis=1) ** 2, axis=1)
+    return bool(varied.size and np.all(steps > UNORDERED * np.var(varied, axis=1)))
+
+
+def noise_of_neighbours(u: Array, y: Array) -> float:
+    """RMS of the noise in ``y``, by the residuals of planes through each row and its neighbours in the space of the
+    inputs ``u`` (float64[inputs, rows]): the order of the rows does not matter, and a smooth function passes through.
+    """
+    varied = u[np.std(u, axis=1) > 0.0]
+    z = ((varied - varied.mean(axis=1, keepdims=True)) / varied.std(axis=1, keepdims=True)).T
+    n, free = z.shape[1] + 1, PLANE_FREE
+    if len(y) < 2 * (n + free):
+        return 0.0
+    some = np.unique(np.linspace(0, len(y) - 1, MOST_PLANES).astype(int))
+    _, rows = scipy.spatial.cKDTree(z).query(z[some], n + free)
+    planes = np.concatenate([np.ones((*rows.shape, 1)), z[rows]], axis=2)
+    fitted = np.einsum("nij,njk,nk->ni", planes, np.linalg.pinv(planes), y[rows])
+    left = np.sum((y[rows] - fitted) ** 2, axis=1)
+    return float(np.sqrt(np.median(left) / scipy.stats.chi2.median(free)))
 
 
 def _quiet(y: Array) -> tuple[float, float]:
