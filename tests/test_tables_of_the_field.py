@@ -7,6 +7,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,14 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from hil.figures import noise_floor
-from hil.logs import Log, LogError, read_log
+from hil.logs import Channel, Log, LogError, read_log
 from hil.logs.guess import mean_stroke
 from hil.logs.joined import joined
 from hil.logs.notes import Note, counted
 from hil.logs.plausible import judge
 from hil.logs.survey import survey
 from hil.logs.units import Units, scale_of
+from hil.replay import replay
 from plant.geometry import load_schedules
 from tests.conftest import examples
 from vaneloop.identification.user_models.data import noise_of_neighbours, without_order
@@ -435,3 +437,23 @@ def test_the_noise_of_a_static_model_does_not_turn_on_the_order_of_its_rows(
     assert noise_of_neighbours(u, y) == pytest.approx(noise, rel=0.15, abs=0.02)
     again = rng.permutation(n)
     assert noise_of_neighbours(u[:, again], y[again]) == pytest.approx(noise_of_neighbours(u, y), rel=0.1)
+
+
+# ---- time's zero -----------------------------------------------------------------------------------------------------
+
+
+@given(st.sampled_from([-5.0, 0.0037, 1000.0, 8000.5]), st.integers(0, 9), st.sampled_from(["none", "n_r", "p_s"]))
+@settings(max_examples=examples(4), deadline=None)
+def test_a_shift_of_all_times_changes_nothing_in_a_replay(shift: float, seed: int, late: str) -> None:
+    columns = run_of(seed, 300)
+    channels = {k: Channel(columns["t"], columns[k]) for k in ("n_dem", "n_r", "x_dem", "x_lvdt", "vigv")}
+    channels["p_s"] = Channel(columns["t"], np.full(300, 21.0))
+    if late != "none":
+        channels[late] = Channel(columns["t"][100:], channels[late].values[100:])
+    here = replay(Log("a", channels))
+    there = replay(Log("a", {k: replace(c, t=c.t + shift) for k, c in channels.items()}))
+    assert there.state_hash == here.state_hash and there.simulated_s == here.simulated_s
+    assert here.t[0] == pytest.approx(0.0 if late == "none" else 0.99) and there.t == pytest.approx(here.t + shift)
+    for a, b in zip(here.signals, there.signals, strict=True):
+        assert a.samples == b.samples and a.rms == pytest.approx(b.rms, rel=1e-6, abs=1e-9)
+    assert max(s.samples for s in here.signals if s.reference == "measured") <= len(here.t) + 1

@@ -21,7 +21,10 @@ from hil.logs.units import NO_UNIT, factor_of, scale_of
 from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES
 
-__all__ = ["ENOUGH", "Files", "Guess", "Guesses", "contradictions", "design_speed", "guess", "mean_stroke", "withdrawn"]
+__all__ = [
+    "ENOUGH", "Files", "Guess", "Guesses", "contradictions", "design_speed", "guess", "mean_stroke", "planned_angles",
+    "withdrawn",
+]  # fmt: skip
 
 ENOUGH = 0.7  # confidence below which a name is only mentioned
 ALIKE = 0.1  # two candidates whose confidences differ by no more are not told apart
@@ -327,23 +330,29 @@ def _off_schedule(stroke: np.ndarray, speed: np.ndarray, tables: Files) -> str:
     return f"it is {far:.2g} mm away, half of the time, from what the schedule says" if far > off else ""
 
 
-def _other_vane(vane: str, channels: Mapping[str, _Samples], tables: Files) -> str:
-    """The stage whose schedule a vane follows instead of its own, by the rotor speed; "" where none is clear."""
+def planned_angles(speed: np.ndarray, tables: Files) -> dict[str, np.ndarray]:
+    """What the schedule has for each vane row at a rotor speed (%): angles (deg)."""
     from plant.geometry import load_schedules  # late: with numba and scipy, which only a guess of these needs
 
     schedules = load_schedules(tables.get("schedules", "schedules.toml"))
+    return dict(zip(schedules.vanes, np.rad2deg(schedules.targets(speed)).T, strict=True))
+
+
+def _other_vane(vane: str, channels: Mapping[str, _Samples], tables: Files) -> str:
+    """The stage whose schedule a vane follows instead of its own, by the rotor speed; "" where none is clear."""
     speed = next((channels[s] for s in ("n_r", "n_dem") if s in channels), None)
-    if vane not in channels or vane not in schedules.vanes or speed is None:
+    if vane not in channels or speed is None:
         return ""
     t, angle = channels[vane]
     inside = (t >= speed[0][0]) & (t <= speed[0][-1])
     if np.count_nonzero(inside) <= 20 or np.ptp(angle[inside]) < 4.0:
         return ""
-    planned = np.rad2deg(schedules.targets(np.interp(t[inside], *speed)))
-    far = np.median(np.abs(planned - angle[inside, None]), axis=0)
-    nearest = schedules.vanes[int(np.argmin(far))]
-    own = float(far[schedules.vanes.index(vane)])
-    return nearest if own > max(2.0, 3.0 * float(far.min())) else ""
+    planned = planned_angles(np.interp(t[inside], *speed), tables)
+    if vane not in planned:
+        return ""
+    far = {v: float(np.median(np.abs(p - angle[inside]))) for v, p in planned.items()}
+    nearest = min(far, key=lambda v: far[v])
+    return nearest if far[vane] > max(2.0, 3.0 * far[nearest]) else ""
 
 
 def _together(a: np.ndarray, b: np.ndarray, least_a: float, least_b: float) -> float:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hil.logs.guess import Files, mean_stroke
+from hil.logs.guess import Files, mean_stroke, planned_angles
 from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES
 
@@ -58,10 +58,7 @@ def _peers(signal: str, channels: Mapping[str, Samples], tables: Files) -> list[
     if signal in ("x_dem", "x_lvdt") and speed is not None:
         out.append(("the schedule", speed[1], np.interp(speed[2], *mean_stroke(tables))))
     if signal in VANES and speed is not None:
-        from plant.geometry import load_schedules  # late: with numba and scipy, which only such a log needs
-
-        schedules = load_schedules(tables.get("schedules", "schedules.toml"))
-        if signal in schedules.vanes:
-            target = np.rad2deg(schedules.targets(speed[2]))[:, schedules.vanes.index(signal)]
-            out.append(("the schedule", speed[1], target))
+        planned = planned_angles(speed[2], tables)
+        if signal in planned:
+            out.append(("the schedule", speed[1], planned[signal]))
     return out

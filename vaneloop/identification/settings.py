@@ -1135,13 +1135,13 @@ UNORDERED = setting(
     1.0,
     "variances",
     "Rows of a static model stand in no order where each input's mean squared step from row to row is more than this.",
-    "textbook: von Neumann's ratio is 2 for rows in random order, near 0 for a run",
+    "principle: von Neumann's ratio is 2 for rows in random order, near 0 for a run",
 )
 MOST_PLANES = setting(
     1000,
     "rows",
     "The noise of rows in no order is told from planes through so many of them and their neighbours.",
-    "speed: the median of so many is known to 2 %",
+    "budget of work: the median of so many is known to 2 %",
 )
 PLANE_FREE = setting(
     5, "rows", "A plane through a row and its neighbours has so many more rows than it has parameters.",
