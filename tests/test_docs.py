@@ -101,6 +101,7 @@ NOT_RUN: dict[str, str] = {
     "vaneloop diagnose SNLS80mV.csv": DATA,
     "vaneloop replay revlog.log --dbc": DATA,
     "vaneloop replay log.mf4 --dbc": DATA,
+    "vaneloop map --check bench.blf": "a log and a DBC of the reader's own; tests/test_corpus.py",
     "vaneloop replay rig.mf4": "a file with several groups of one channel name; tests/test_logs.py writes one",
     "vaneloop extend warm_play.parquet --effect play_temperature": "after the page's change to the library",
     "python -m plant.effects_page": "overwrites docs/effects.md; tests/test_effects.py compares it",

@@ -118,6 +118,7 @@ def _frames(path: Path, of: Format, ours: Frames) -> Iterator[Compared]:
 
 def _signals(bus: Bus, signals: dict[str, str]) -> Iterator[Compared]:
     """Signals cut out of the frames that VaneLoop read, beside cantools'."""
+    decoded: dict[int, list[dict[str, Any]]] = {}
     for signal, name in signals.items():
         keys = [k for k, names in bus.names.items() if name in names]
         for key in keys:
@@ -126,13 +127,11 @@ def _signals(bus: Bus, signals: dict[str, str]) -> Iterator[Compared]:
             ours = bus.series(key)
             kept = ours.t <= frames.t[rows[-1]] if rows.size else np.zeros(ours.t.size, bool)
             own = dict(zip(ours.t[kept].tolist(), ours.values[kept].tolist(), strict=True))
-            theirs: dict[float, float] = {}
-            for t, n, data in zip(
-                frames.t[rows].tolist(), frames.length[rows].tolist(), frames.data[rows], strict=True
-            ):
-                value = _decoded(message.layout, branches, data[:n].tobytes())
-                if value is not None:
-                    theirs[t] = value
+            if message.ident not in decoded:
+                cut = zip(frames.data[rows], frames.length[rows].tolist(), strict=True)
+                decoded[message.ident] = [_decoded(message.layout, data[:n].tobytes()) for data, n in cut]
+            pairs = zip(frames.t[rows].tolist(), decoded[message.ident], strict=True)
+            theirs = {t: float(found[wanted]) for t, found in pairs if (wanted := branches[0].name) in found}
             wrong = [t for t, v in own.items() if not np.isclose(v, theirs.get(t, np.nan), rtol=1e-12, atol=1e-12)]
             more = len(theirs) - len(own)
             said = (
@@ -145,14 +144,12 @@ def _signals(bus: Bus, signals: dict[str, str]) -> Iterator[Compared]:
             )  # fmt: skip
 
 
-def _decoded(layout: Any, branches: list[Any], data: bytes) -> float | None:
-    """The value of a signal in a frame; None where it is not in it."""
+def _decoded(layout: Any, data: bytes) -> dict[str, Any]:
+    """The values of the signals that are in a frame."""
     try:
-        found = layout.decode(data, decode_choices=False, allow_truncated=True)
+        return dict(layout.decode(data, decode_choices=False, allow_truncated=True))
     except Exception:  # cantools: a selector that is not known, or data that end before it
-        return None
-    value = found.get(branches[0].name)
-    return None if value is None else float(value)
+        return {}
 
 
 def _channels(path: Path, source: Source, signals: dict[str, str]) -> Iterator[Compared]:
