@@ -235,6 +235,14 @@ ALL = {page: steps_of(page) for page in PAGES}
 REAL = [page for page in PAGES if ALL[page]]
 
 
+@pytest.mark.parametrize("page", PAGES)
+def test_every_link_leads_to_a_file_of_the_checkout(page: str) -> None:
+    """Where there is no site, too: on a page of a repository's browser, in an editor."""
+    text = re.sub(r"^```.*?^```", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.S | re.M)
+    links = [x for x in re.findall(r"\]\(([^)\s]+)\)", text) if not re.match(r"https?:|#|mailto:", x)]
+    assert [x for x in links if not ((ROOT / page).parent / x.split("#")[0]).exists()] == []
+
+
 def test_the_pages_hold_what_this_test_is_for() -> None:
     assert set(DEAR) <= set(REAL)
     commands = [s.text for steps in ALL.values() for s in steps if s.kind == "command"]

@@ -11,13 +11,16 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cantools
 import pytest
 
 import vaneloop
 from hil.inject.scenario import library
+from tests.browser import CHROMIUM, LONG, WHY_NOT, driver, violations
 from tests.conftest import ROOT
 from vaneloop.base import terminal
 from vaneloop.base.tables import load_toml, path
@@ -99,6 +102,82 @@ def test_the_search_finds_options_and_effects_and_nothing_is_fetched(site: Path)
     for page in site.rglob("*.html"):
         loads = re.findall(r'(?:src|<link[^>]* href)="(https?:[^"]+)"', page.read_text(encoding="utf-8"))
         assert not loads, f"{page.name}: {loads}"
+
+
+# what a reader types -> the page that must be among the first three found
+SEARCHES = {
+    "grey-box": "your_own_model", "system identification": "diagnosis", "identification": "diagnosis",
+    "residual": "reading_an_answer", "FMU": "fmu", "FMI": "fmu", "co-simulation": "fmu", "XCP": "xcp",
+    "A2L": "xcp", "CANape": "coming_from_inca", "UDS": "uds", "ISO 14229": "uds", "trouble code": "uds",
+    "SecOC": "bus", "learn": "learn", "symbolic regression": "learn", "fleet": "fleet",
+    "predictive maintenance": "fleet", "Monte Carlo": "campaigns", "failure probability": "campaigns",
+    "HIL": "real_time", "SIL": "own_controller", "fault injection": "injection",
+    "pandas": "python", "DataFrame": "python", "lookup table": "scheduling", "phase margin": "control_design",
+    "backlash": "effects", "valve_dead_band": "effects", "noise floor": "reading_an_answer",
+    "confidence interval": "reading_an_answer", "cannot tell": "reading_an_answer",
+    "--design-rpm": "reference/commands/", "--system": "reference/commands/", "--tolerance": "reference/commands/",
+    "--xcp-open": "reference/commands/run", "--secoc": "reference/commands/", "--shape": "reference/commands/learn",
+    ".mf4": "logs", ".blf": "logs", ".parquet": "logs", ".a2l": "xcp", ".fmu": "fmu", ".dbc": "logs",
+    "export-fmu": "reference/commands/export-fmu", "new-controller": "reference/commands/new-controller",
+    "least squares": "methods", "hysteresis": "effects", "Simulink": "coming_from_simulink",
+    "CAPL": "coming_from_canoe", "vaneloop.diagnose": "diagnos",
+}  # fmt: skip
+# pages of every kind, which are held against axe-core
+PAGES = ("index", "diagnosis", "settings", "notebooks/missing_physics", "reference/commands/run", "reference/python")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    if CHROMIUM is None:
+        pytest.skip(WHY_NOT)
+    with driver() as p:
+        b = p.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield b
+        b.close()
+
+
+def test_the_search_finds_options_commands_suffixes_and_the_field_s_synonyms(site: Path, browser: Any) -> None:
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.set_default_timeout(LONG)
+    page.goto((site / "index.html").as_uri())
+    field = page.locator("input.md-search__input")
+
+    def asked(words: str, until: str) -> list[str]:
+        """The first three pages found."""
+        field.click()
+        field.fill(words)
+        field.press("Shift")  # the search looks when a key goes up
+        page.wait_for_function(f"() => document.querySelectorAll('.md-search-result__item').length {until}")
+        return page.evaluate(
+            "[...document.querySelectorAll('.md-search-result__item > a')].slice(0, 3)"
+            ".map((a) => new URL(a.href).pathname)"
+        )
+
+    missed = {}
+    for words, wanted in SEARCHES.items():
+        asked("zzzqqq", "=== 0")
+        found = asked(words, "> 0")
+        if not any(p.removeprefix(f"{site.as_posix()}/").startswith(wanted) for p in found):
+            missed[words] = found
+    page.context.close()
+    assert not missed and len(SEARCHES) >= 40
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_site_is_open_to_all(site: Path, browser: Any, scheme: str) -> None:
+    context = browser.new_context(color_scheme=scheme)
+    page = context.new_page()
+    page.set_default_timeout(LONG)
+    for width in (1280, 360):
+        page.set_viewport_size({"width": width, "height": 900})
+        for name in PAGES:
+            page.goto((site / f"{name}.html").as_uri())
+            page.wait_for_function(
+                "document.querySelectorAll('.md-typeset pre').length === "
+                "document.querySelectorAll('.md-typeset pre .md-code__nav[aria-label]').length"
+            )
+            assert not violations(page), f"{name} at {width}, {scheme}"
+    context.close()
 
 
 @pytest.fixture

@@ -1,9 +1,12 @@
-"""What MkDocs asks while it builds the site: pages made from the code, notebooks as pages, a place for every page."""
+"""What MkDocs asks while it builds the site: pages made from the code, notebooks as pages, a place for every page, and
+what its search and a screen reader need.
+"""
 
 from __future__ import annotations
 
 import re
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,7 @@ sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]  # this checkout is descr
 import notebooks  # noqa: E402
 import reference  # noqa: E402
 from mkdocs.config.defaults import MkDocsConfig  # noqa: E402
+from mkdocs.exceptions import PluginError  # noqa: E402
 from mkdocs.structure.files import File, Files  # noqa: E402
 from mkdocs.structure.pages import Page  # noqa: E402
 from mkdocs.utils import get_relative_url  # noqa: E402
@@ -28,6 +32,23 @@ PLACES = {
     "coming_from_": ("How-to guides", "Coming from another tool"),
     "": ("How-to guides", "More"),
 }
+SYNONYMS = tomllib.loads((ROOT / "docs/site/search_words.toml").read_text("utf-8"))  # page -> words that lead to it
+# Material's search takes "--design-rpm" for words that a page must not have. It is asked for the pages of the commands
+# that have the option, which `tagged` gives a word for each, and for its words.
+ASKED = "e=ce(e)"
+MEANT = (
+    r'e=ce(e.replace(/(^|\s)--(\w[\w-]*)/g,(m,a,n)=>a+"option_"+n.replace(/-/g,"_")+" "+n)'
+    r'.replace(/(^|\s)-+(?=\S)/g,"$1"))'
+)
+# a file of the checkout -> the page that is made from it, to which a link to it leads on the site
+MADE_FROM = {
+    "tables/vgv.dbc": "reference/can.md",
+    "tables/calibration.toml": "reference/calibration.md",
+    "vaneloop/cli/main.py": "reference/index.md",
+    "vaneloop/identification/candidates/library.py": "reference/laws.md",
+}
+# what a screen reader is not told: markup as Material writes it -> with a name, or reached by keyboard
+UNNAMED = {'data-md-component="search" role="dialog"': 'data-md-component="search" role="dialog" aria-label="Search"'}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -61,22 +82,48 @@ def placed(nav: list[Any], pages: list[str]) -> list[Any]:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """A link to a file outside of docs/ leads nowhere on the site: its text stays. Lists get the blank line that
-    Markdown of the site wants before them.
+    """A link to a file from which a page is made leads to that page, on the site; of a link to another file outside of
+    docs/ the text stays. Lists get the blank line that Markdown of the site wants before them.
     """
+    page.meta["tags"] = tagged(page.file.src_uri)
     up = "../" * (page.file.src_uri.count("/") + 1)
+    for file, made in MADE_FROM.items():
+        markdown = markdown.replace(f"]({up}{file})", f"]({up.removeprefix('../')}{made})")
+    markdown = re.sub(r"\]\(((?:\.\./)*notebooks/\w+)\.ipynb\)", r"](\1.md)", markdown)
     markdown = re.sub(rf"\[([^\]]+)\]\({re.escape(up)}[^)]*\)", r"\1", markdown)
     return spaced(markdown)
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
     """Nothing is fetched from elsewhere: the site has its own copy of what its search needs."""
-    return output.replace(WORKER, get_relative_url(OURS, page.url))
+    return named(output).replace(WORKER, get_relative_url(OURS, page.url))
 
 
 def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
     """The same for pages that no Markdown stands behind."""
-    return output_content.replace(WORKER, f"/{OURS}")
+    return named(output_content).replace(WORKER, f"/{OURS}")
+
+
+def on_post_build(config: MkDocsConfig) -> None:
+    """Let the search take an option for its words."""
+    (worker,) = Path(config.site_dir).glob("assets/javascripts/workers/search.*.min.js")
+    text = worker.read_text("utf-8")
+    if text.count(ASKED) != 1:
+        raise PluginError(f"{worker.name}: {ASKED!r} is not there once; the search would not find options")
+    worker.write_text(text.replace(ASKED, MEANT), "utf-8")
+
+
+def tagged(page: str) -> list[str]:
+    """Words by which the search finds a page beside its own: synonyms, and of a command's page its options."""
+    options = reference.options_of(Path(page).stem) if page.startswith(COMMANDS) else []
+    return [*SYNONYMS.get(page, []), *(f"option_{o.lstrip('-').replace('-', '_')}" for o in options)]
+
+
+def named(output: str) -> str:
+    """A page whose parts have the names that a screen reader tells."""
+    for plain, better in UNNAMED.items():
+        output = output.replace(plain, better)
+    return output
 
 
 def spaced(markdown: str) -> str:

@@ -26,7 +26,7 @@ from vaneloop.base.tables import Bound, load_toml, path
 from vaneloop.cli.main import COMMANDS, GROUPS
 from vaneloop.identification.candidates.library import LAWS, Size
 
-__all__ = ["pages"]
+__all__ = ["options_of", "pages"]
 
 ROOT = Path(__file__).resolve().parents[2]
 MADE = "*Made from the code when the site is built.*"
@@ -71,11 +71,26 @@ def index_page() -> str:
     return "\n\n".join(out)
 
 
-def command_page(name: str) -> str:
-    """A command as its own parser describes it."""
+def parser_of(name: str) -> terminal.Parser:
+    """The parser of a command."""
     module = importlib.import_module(COMMANDS[name][0])
     parser = terminal.Parser(prog=f"vaneloop {name}", description=module.DESCRIPTION)
     module.add_options(parser)
+    return parser
+
+
+def options_of(name: str) -> list[str]:
+    """Every option of a command, those of its parts (fleet run) too."""
+    parsers = [parser_of(name)]
+    for action in parsers[0]._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            parsers += action.choices.values()
+    return sorted({o for p in parsers for a in p._actions for o in a.option_strings if o.startswith("--")})
+
+
+def command_page(name: str) -> str:
+    """A command as its own parser describes it."""
+    parser = parser_of(name)
     out = [f"# {name}", prose(f"{parser.description or ''}\n\n{parser.epilog or ''}")]
     for group in parser._action_groups:
         rows = [(invocation(a), meaning(parser, a)) for a in group._group_actions if a.help != argparse.SUPPRESS]
