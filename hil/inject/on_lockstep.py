@@ -39,6 +39,7 @@ __all__ = [
     "changed_rows",
     "check_stages",
     "demand_at",
+    "sender_of",
     "sent_by",
 ]
 
@@ -198,7 +199,8 @@ class OnLockstep:
         self._recorded: list[tuple[int, int, int]] = []
         self._keep = any(isinstance(a, Replay) and a.begin is not None for a in actions)
         keys = _keys(scenario)
-        self._vgv, self._demanding = (node, ecu) if keys is None else _secured(node, ecu, keys[0])
+        both: tuple[Any, Any] = (node, ecu) if keys is None else _secured(node, ecu, keys[0])
+        self._vgv, self._demanding = both
         self._intruders = [Intruder(a, c, self._recorded, keys) for a, c in zip(of[Outsider], chance[2:], strict=True)]
         self._machines = [MachineChange(a, node, ecu) for a in of[Machine]]  # type: ignore[arg-type]
         channel = Channel(seed=scenario.seed)

@@ -140,25 +140,25 @@ def facts_of(claim: Expect, trace: Trace, slack: float = 0.0) -> Facts | None:
         return Facts(nearest=float(np.min(np.abs(rises - claim.at), initial=np.inf)))
     if claim.by is not None:
         inside = t >= claim.after - EDGE
-        return Facts(first=float(np.min(t[truth & inside], initial=np.inf)), **_distances(claim, trace, inside))
+        best, worst = _distances(claim, trace, inside)
+        return Facts(first=float(np.min(t[truth & inside], initial=np.inf)), best=best, worst=worst)
     begin, end = claim.during or (0.0, float(t[-1]))
     inside = (t >= begin + slack - EDGE) & (t <= end - slack + EDGE) if claim.during else np.ones(len(t), bool)
     broken = truth if claim.never else ~truth
     last = float(np.max(t[broken & (t < begin - EDGE)], initial=-np.inf))
-    return Facts(
-        seen=int(np.sum(inside)), broken=int(np.sum(broken & inside)), last=last, **_distances(claim, trace, inside)
-    )
+    best, worst = _distances(claim, trace, inside)
+    return Facts(best=best, worst=worst, seen=int(np.sum(inside)), broken=int(np.sum(broken & inside)), last=last)
 
 
-def _distances(claim: Expect, trace: Trace, inside: np.ndarray) -> dict[str, float]:
-    """Distances of a signal to its limits (`Facts`)."""
+def _distances(claim: Expect, trace: Trace, inside: np.ndarray) -> tuple[float, float]:
+    """Distances of a signal to its limits: of its best and its worst sample; NaN where there are none."""
     if claim.signal is None or not inside.any():
-        return {}
+        return np.nan, np.nan
     values = trace.signals[claim.signal][inside]
     low = -np.inf if claim.low is None else claim.low
     high = np.inf if claim.high is None else claim.high
     distance = np.minimum(values - low, high - values)
-    return {"best": float(np.max(distance)), "worst": float(np.min(distance))}
+    return float(np.max(distance)), float(np.min(distance))
 
 
 def holds(claim: Expect, facts: Facts, slack: float = 0.0) -> bool:
