@@ -331,9 +331,9 @@ def _fitting(rows: bytes, separator: str, least: int, cells: int) -> tuple[bytes
     counted = np.zeros(len(lines), np.int64)
     for i, line in enumerate(lines):
         if (there := line.count(between) + 1) != cells:
-            row = line.split(between)
-            fits = _fits(row, least, cells)
-            lines[i] = between.join(row[:cells]) + between * max(cells - there, 0) if fits else between * (cells - 1)
+            parts = line.split(between)
+            fits = _fits(parts, least, cells)
+            lines[i] = between.join(parts[:cells]) + between * max(cells - there, 0) if fits else between * (cells - 1)
             counted[i] = 0 if fits else there
     return b"\n".join(lines) + b"\n", counted
 

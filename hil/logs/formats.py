@@ -200,8 +200,8 @@ OURS = (
         source="hil.logs.mdf:open_mdf", channels="hil.logs.mdf_write:write_mdf3",
     ),
     Format(
-        "CSV", (".csv",), "a header, perhaps with units below and lines before it; `,` `;` or tab; decimal point or comma; "
-        "one time or one a column",
+        "CSV", (".csv",), "a header, perhaps with units below and lines before it; `,` `;` or tab; decimal point or "
+        "comma; one time or one a column",
         names="columns",
         source="hil.logs.csv_format:open_csv", channels="hil.logs.csv_format:write_csv",
         recording="hil.logs.recordings:read_text",

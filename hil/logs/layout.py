@@ -157,7 +157,8 @@ def _labview_units(said: dict[str, list[str]], keys: list[str]) -> dict[str, str
 
 def _behind_labview(raw: bytes, line: Line) -> tuple[list[Line], Line]:
     """The lines of a LabVIEW measurement file that stand before the header of its first segment, and that header."""
-    before, ends = [], 0
+    before: list[Line] = []
+    ends = 0
     for one in _lines(raw, line, 4 * LOOKED_AT):
         if ends == 2 or (ends and _DATUM.fullmatch(opening(one.text))):
             return before, one

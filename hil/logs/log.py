@@ -489,7 +489,7 @@ def _own_samples(channels: dict[str, Channel], notes: list[str]) -> dict[str, Ch
         if j.sure:
             true = np.rint((c.t - c.t[0]) / step).astype(np.int64) % j.every == j.first
             notes.append(Note(f"{said}: only these are taken, {np.count_nonzero(true):,} of {true.size:,}", "left out",
-                              name, np.count_nonzero(~true)))  # fmt: skip
+                              name, int(np.count_nonzero(~true))))  # fmt: skip
             out[name] = replace(c, t=c.t[true], values=c.values[true], apart=apart)
         elif j.every > 2:
             notes.append(Note(f"{said}", "filled", name, c.t.size - c.t.size // j.every))

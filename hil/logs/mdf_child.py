@@ -59,12 +59,11 @@ def answer(request: bytes, out: BinaryIO) -> None:
         limit = now + MEMORY[0] + MEMORY[1] * os.path.getsize(path)
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     arrays: dict[str, np.ndarray] = {}
+    reply: dict[str, Any] = {}
     try:
         if asked.get("record"):
-            reply = {}
             arrays.update(zip(("us", "rows", "sent"), pkgutil.resolve_name(RECORDING)(path), strict=True))
         elif asked.get("frames"):
-            reply = {}
             arrays.update(pkgutil.resolve_name(OTHERS)(path))
         elif "channels" in asked:
             reply = {}

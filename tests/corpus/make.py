@@ -61,6 +61,8 @@ def _by_python_can(folder: Path) -> None:
                 for m in messages(fd):
                     if suffix != ".trc" or not m.is_remote_frame:
                         out.on_message_received(m)
+    trace = folder / "python_can_classic.trc"  # whose head says where it was written
+    trace.write_bytes(trace.read_bytes().replace(str(trace.resolve()).encode(), trace.name.encode()))
     with can.MF4Writer(str(folder / "python_can.mf4")) as mf4:
         for m in messages(False):
             mf4.on_message_received(m)

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vaneloop.identification.least_squares.problem import NINETY, Fit, LeastSquaresProblem
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.selection.calibration import trust
 from vaneloop.identification.selection.rules import Decision
+from vaneloop.identification.settings import NINETY
 from vaneloop.identification.subsystem import Array, Parameter, Stage
 
 __all__ = [

@@ -41,6 +41,12 @@ def setting(value: Value, unit: str, meaning: str, origin: str) -> Value:
 
 # ---- Least squares --------------------------------------------------------------------------------------------------
 under("Least squares")
+NINETY = setting(
+    1.645,
+    "standard errors",
+    "An interval goes so far to each side.",
+    "principle: it holds the true value nine times in ten",
+)
 EVIDENCE = setting(
     200.0,
     "observations",
@@ -1144,7 +1150,9 @@ MOST_PLANES = setting(
     "budget of work: the median of so many is known to 2 %",
 )
 PLANE_FREE = setting(
-    5, "rows", "A plane through a row and its neighbours has so many more rows than it has parameters.",
+    5,
+    "rows",
+    "A plane through a row and its neighbours has so many more rows than it has parameters.",
     "judgement: the fewer, the nearer they are",
 )
 LONGEST_SPIKE = setting(

@@ -29,13 +29,13 @@ from vaneloop.identification.settings import (
     MAX_VALUES,
     MIN_BLOCKS,
     MOST_BLOCKS,
+    NINETY,
     USUAL_BLOCKS,
 )
 from vaneloop.identification.subsystem import Array, Stage, StageError
 
-__all__ = ["NINETY", "Fit", "LeastSquaresProblem", "Task", "covariance", "finished", "recalibrate"]
+__all__ = ["Fit", "LeastSquaresProblem", "Task", "covariance", "finished", "recalibrate"]
 
-NINETY = 1.645  # standard errors to either side of a value that hold the true one nine times in ten
 Answer = TypeVar("Answer")
 Task = Generator[
     Array, Array, Answer
