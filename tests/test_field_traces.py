@@ -221,6 +221,25 @@ def test_a_tool_s_trace_is_read_to_the_last_bit(tool: str, data: st.DataObject) 
         assert frames.bus.tolist() == [f.bus for f in log]
 
 
+@pytest.mark.parametrize("tool", TRACES)
+@given(st.data())
+@settings(max_examples=examples(40), deadline=None)
+def test_a_damaged_trace_is_read_or_refused_in_one_line(tool: str, data: st.DataObject) -> None:
+    write, name, _, _ = TRACES[tool]
+    raw = bytearray(write(data.draw(recordings())).encode())
+    for _ in range(data.draw(st.integers(1, 6))):
+        raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
+    with tempfile.TemporaryDirectory() as folder:
+        (path := Path(folder) / name).write_bytes(raw[: data.draw(st.integers(1, len(raw)))])
+        try:
+            frames = format_at(path, "frames").read_frames(path)
+        except LogError as e:
+            assert "\n" not in str(e) and str(path) in str(e)
+        else:
+            assert (np.diff(frames.t) >= 0).all() and np.isfinite(frames.t).all()
+            assert (frames.length <= frames.data.shape[1]).all() and frames.t.size
+
+
 @given(recordings(longest=64))
 @settings(max_examples=examples(40), deadline=None)
 def test_a_csv_of_python_can_is_read_as_it_reads_it(log: list[Frame]) -> None:

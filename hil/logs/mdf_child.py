@@ -61,12 +61,12 @@ def answer(request: bytes, out: BinaryIO) -> None:
     arrays: dict[str, np.ndarray] = {}
     reply: dict[str, Any] = {}
     try:
+        reply: dict[str, Any] = {}
         if asked.get("record"):
             arrays.update(zip(("us", "rows", "sent"), pkgutil.resolve_name(RECORDING)(path), strict=True))
         elif asked.get("frames"):
             arrays.update(pkgutil.resolve_name(OTHERS)(path))
         elif "channels" in asked:
-            reply = {}
             with asammdf.MDF(path) as mdf:
                 places = {key: (g, i) for key, g, i, *_ in _found(mdf)}
                 for n, key in enumerate(asked["channels"]):
