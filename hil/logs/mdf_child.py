@@ -59,7 +59,6 @@ def answer(request: bytes, out: BinaryIO) -> None:
         limit = now + MEMORY[0] + MEMORY[1] * os.path.getsize(path)
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     arrays: dict[str, np.ndarray] = {}
-    reply: dict[str, Any] = {}
     try:
         reply: dict[str, Any] = {}
         if asked.get("record"):

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 
 from vaneloop.base.compiled import compiled
-from vaneloop.identification.least_squares.noise import colour_of, tolerance
+from vaneloop.identification.least_squares.noise import colour_of, most_floor, tolerance
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
 from vaneloop.identification.results import rms_per_output
 from vaneloop.identification.settings import AGREES, COLOUR, NOISE_KNOWN_TO, REGIME_BINS, REGIME_LEVEL, SHAPE_TOLD
@@ -262,11 +262,10 @@ def regimes(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> list[Re
             raw.append((k, output, name, edges, (n, square, floor), moments))
     out = []
     for k, output, name, edges, sums, moments in raw:
-        # what is no more than noise everywhere else is no matter of this bin
+        # what all other bins have, too, is no matter of this one, as far as the floor may be wrong
         total, squares, expected = (v.sum() - v.sum(axis=1) for v in sums)
         elsewhere = squares / np.maximum(np.maximum(expected, total), 1.0)
-        noise = elsewhere <= tolerance(int(sums[0].sum()), correlation) ** 2
-        of_noise = np.where(noise, np.maximum(known, elsewhere), known)
+        of_noise = np.maximum(known, np.minimum(elsewhere, most_floor(int(sums[0].sum()), correlation) ** 2))
         hot, n, ms = stands_out(*sums, of_noise, looks, correlation)
         ratio = np.sqrt(ms)
         excess = np.maximum(ms - 1.0, 0.0)

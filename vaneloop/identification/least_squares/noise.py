@@ -8,7 +8,7 @@ from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProbl
 from vaneloop.identification.settings import AGREES, COLOUR, SPREADS
 from vaneloop.identification.subsystem import Array
 
-__all__ = ["colour_of", "correlation_of", "floor_deviation", "tolerance"]
+__all__ = ["colour_of", "correlation_of", "floor_deviation", "most_floor", "tolerance"]
 
 
 def correlation_of(judge: LeastSquaresProblem, fit: Fit) -> float:
@@ -49,6 +49,11 @@ def floor_deviation(m: Array | int, n: int, correlation: float) -> Array:
     correlation  samples of the error that count as one observation, c
     """
     return np.asarray(np.sqrt(correlation / (2.0 * np.asarray(m)) + min(correlation, COLOUR[1]) / n))
+
+
+def most_floor(n: int, colour: float) -> float:
+    """The most that a noise floor from a log of n samples may be wrong by: true floor over estimate."""
+    return 1.0 + SPREADS * float(np.sqrt(colour / max(n, 1)))
 
 
 def tolerance(n: int, colour: float) -> float:
