@@ -181,7 +181,7 @@ def figures(answer: Answer) -> str:
 
 
 def test_a_frame_a_path_and_a_log_give_one_answer(log: vaneloop.Log, tmp_path: Path) -> None:
-    file = tmp_path / "run.parquet"
+    file, log = tmp_path / "run.parquet", log[["x_lvdt", "i_cmd", "p_s"]]
     vaneloop.write_log(file, log.channels)
     asked: list[Any] = [log, log.to_pandas(), file, str(file)]
     said = {figures(vaneloop.compare(x)) for x in asked}
@@ -241,7 +241,7 @@ def test_what_is_no_number_is_within_no_tolerance() -> None:
 
 
 def test_an_answer_is_short_in_a_console_and_light_in_a_notebook(better: Extended, log: vaneloop.Log) -> None:
-    for answer in (better, vaneloop.compare(log), vaneloop.compare(log.to_pandas()[["x_lvdt", "vigv"]])):
+    for answer in (better, vaneloop.compare(log)):
         assert len(repr(answer)) < 400 and "\n" not in repr(answer)
         page = answer._repr_html_()
         assert len(page) < MOST_BYTES and 'src="data:image/png;base64,' in page and "<script" not in page
@@ -343,12 +343,16 @@ def test_logs_and_frames_of_a_model_of_ones_own_give_one_answer(tmp_path: Path) 
     asked: list[Any] = [frame, log, record, tmp_path / "bench.csv", [frame]]
     values = [vaneloop.compare(x, s).params["gain"].value for x in asked]
     assert values == pytest.approx([values[0]] * len(asked), rel=1e-9)
-    both = vaneloop.diagnose([frame, bench(2)], s, test=[bench(3)])
-    assert isinstance(both, Diagnosed) and both.verdict == "none" and len(list(both.residuals)) == 3
     with pytest.raises(vaneloop.InputError, match="no u"):
         vaneloop.compare(log[["y"]], s)
     with pytest.raises(vaneloop.InputError, match="y is in kg"):
         vaneloop.compare(vaneloop.Log.from_dataframe(frame, units={"y": "kg"}), s)
+
+
+@pytest.mark.slow
+def test_curves_of_several_logs_bear_their_names() -> None:
+    both = vaneloop.diagnose([bench(), bench(2)], system(), test=[bench(3)])
+    assert both.verdict == "none" and list(both.residuals) == [f"DataFrame{k * chr(39)}: y" for k in range(3)]
 
 
 @pytest.mark.slow
