@@ -65,7 +65,7 @@ def test_diagnose_says_in_a_notebook_what_the_command_says(diagnosed: Diagnosed,
 
 @pytest.mark.slow
 def test_a_diagnosis_page_has_the_numbers_of_its_json(diagnosed: Diagnosed, tmp_path: Path) -> None:
-    from vaneloop.pages.style import number
+    from vaneloop.pages.style import interval, number
 
     there, data = cells(shown(diagnosed, tmp_path)), diagnosed.to_dict()
     for s in data["stages"]:
@@ -74,7 +74,7 @@ def test_a_diagnosis_page_has_the_numbers_of_its_json(diagnosed: Diagnosed, tmp_
     for e in data["effects"]:
         assert {e["effect"], f"{100 * e['probability']:.0f} %"} <= there
         for name, p in e["parameters"].items():
-            assert {name, *(number(p[k]) for k in ("value", "low", "high"))} <= there
+            assert {name, *map(str, interval(*(p[k] for k in ("value", "low", "high"))))} <= there
     for r in data["recalibrated"]:
         assert {r["parameter"], number(r["value"])} <= there
 
