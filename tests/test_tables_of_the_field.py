@@ -198,7 +198,12 @@ def test_where_the_header_stands_again_a_part_is_named_and_each_can_be_read(
     with pytest.raises(LogError, match="part 3: the log has 2 parts"):
         read(tmp_path, text, part=3)
     with pytest.raises(LogError, match=f"row {cut + 6}: another header stands there"):
-        read(tmp_path, "\n".join(['"Rig 5"', '"Capture Date: 1"', head, *first, "", "", f"{head}\tnew", *again]))
+        read(
+            tmp_path,
+            "\n".join(
+                ['"Rig 5"', '"Capture Date: 1"', head, *first, "", "", head.replace("t\t", "t\tnew_", 1), *again]
+            ),
+        )
 
 
 @given(
@@ -407,9 +412,7 @@ def test_samples_joined_by_straight_lines_are_taken_at_their_own_rate(
     assert noise_floor(c.t, c.values) == pytest.approx(noise, rel=0.35, abs=1e-3)
 
 
-@given(
-    st.integers(0, 999), st.floats(0.0, 0.2), st.integers(1, 4), st.sampled_from(["sine", "program", "held", "noise"])
-)
+@given(st.integers(0, 999), st.floats(0.0, 0.2), st.integers(1, 4), st.sampled_from(["sine", "program", "held"]))
 @TWICE
 def test_a_channel_that_was_sampled_in_each_row_is_left_alone(seed: int, noise: float, digits: int, how: str) -> None:
     rng, t = np.random.default_rng(seed), np.arange(3000) * 0.01

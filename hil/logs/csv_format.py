@@ -114,7 +114,7 @@ def _parts(path: Path, raw: bytes, layout: Layout, time: str) -> tuple[bytes, tu
     """
     head = raw[layout.head.at : layout.head.behind].strip(b"\r\n")
     begins = head.split(layout.separator.encode(), 1)[0] + layout.separator.encode()
-    if len(begins) < 2 or raw.find(b"\n" + begins, layout.at - 1) < 0:
+    if len(begins) < 2 or raw.find(head, layout.at) < 0:  # another header has no numbers, and is met by that
         return raw, (0,)
     out, parts, kept, at = [], [0], layout.at, layout.at - 1
     row, counted = layout.first, layout.at
@@ -285,6 +285,10 @@ class _Csv:
                 if key in self.times and (t := self._dates(key, text)) is not None:
                     return t
                 where = f"column {key!r}, row {row + self.first}"
+                if key in self.times and text[row] == self.layout.headers[self.keys.index(key)]:
+                    raise LogError(
+                        f"{self.path}: row {row + self.first}: another header stands there; cut the file before it"
+                    ) from None
                 raise LogError(f"{self.path}: {where}: {text[row][:40]!r} is not a number") from None
         return values
 

@@ -10,15 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Joined", "joined"]
+__all__ = ["Joined", "joined", "seems_joined"]
 
-SLOWEST = 50  # rows from one true sample to the next
+SLOWEST = 20  # rows from one true sample to the next; corners farther apart may be a program of commands
 FEWEST = 20  # corners that tell by themselves
 CHANCE = 1e-8  # at which corners of a signal that was sampled in each row would stand so
 STRAY = 0.01  # share of corners that may stand in other rows
 TELLING = 0.25  # share of true samples with a corner, from which on the channel tells by itself
 UNIFORM = 0.05  # of the step, by which times may be off
 DECIMALS = 9
+LOOKED_AT = 1500  # rows of a part of a long channel
 
 
 class Joined(NamedTuple):
@@ -57,6 +58,12 @@ def joined(t: np.ndarray, values: np.ndarray) -> Joined | None:
             sure = corners.size >= FEWEST and corners.size * every >= TELLING * row[-1]
             return Joined(every, first, sure)
     return None
+
+
+def seems_joined(t: np.ndarray, values: np.ndarray) -> bool:
+    """Whether the channel is surely joined at its start, in its middle or at its end: a long one is looked at there."""
+    parts = (slice(k, k + LOOKED_AT) for k in sorted({0, max(t.size - LOOKED_AT, 0) // 2, max(t.size - LOOKED_AT, 0)}))
+    return any((j := joined(t[part], values[part])) is not None and j.sure for part in parts)
 
 
 def _last_digit(values: np.ndarray) -> np.ndarray:

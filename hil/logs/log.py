@@ -22,7 +22,7 @@ from hil.logs.channels import Channels
 from hil.logs.dataframe import frame_columns, is_frame, name_of, open_frame
 from hil.logs.formats import format_at
 from hil.logs.guess import Files, Guess
-from hil.logs.joined import joined
+from hil.logs.joined import joined, seems_joined
 from hil.logs.notes import MOST_ROWS, Note
 from hil.logs.opening import Opened, is_ours, open_log, sketch, wanted_design_speed
 from hil.logs.scale import proposed_scale
@@ -477,7 +477,10 @@ def _own_samples(channels: dict[str, Channel], notes: list[str]) -> dict[str, Ch
     """Channels at the rate at which they were sampled, where an exporter joined their samples by straight lines; a
     command that seldom bends keeps its lines, but says how far its samples are apart.
     """
-    found = {name: j for name, c in channels.items() if not c.framed and (j := joined(c.t, c.values)) is not None}
+    polled = {name: c for name, c in channels.items() if not c.framed}
+    if not any(seems_joined(c.t, c.values) for c in polled.values()):
+        return channels
+    found = {name: j for name, c in polled.items() if (j := joined(c.t, c.values)) is not None}
     if not any(j.sure for j in found.values()):
         return channels
     out = dict(channels)
