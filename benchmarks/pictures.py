@@ -1,16 +1,36 @@
-"""Pictures of the workbench for README and docs: ``python -m benchmarks.pictures [FOLDER]``."""
+"""Pictures of README and docs: ``python -m benchmarks.pictures [FOLDER]``. They are figures of the pages that commands
+write, and pages of the workbench. Beside the pictures lies what their bars say (`FIGURES`).
+"""
 
 from __future__ import annotations
 
+import json
+import os
+import shlex
+import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.measure import ROOT
-from benchmarks.web import PATIENCE, workbench
+from benchmarks.web import PATIENCE, chromium, workbench
+from vaneloop.base.files import write
 
-__all__ = ["take"]
+__all__ = ["FIGURES", "REPORTS", "take"]
+
+FIGURES = "figures.json"  # picture -> the words on its bars, from left to right
+EXAMPLE = "examples/hidden_effect.parquet"
+# command that writes a page -> picture -> its figures, by a caption's words or their number on the page
+REPORTS: dict[str, dict[str, tuple[str | int, ...]]] = {
+    f"locate {EXAMPLE}": {
+        "tutorial_error": ("actuator: measured and model",), "tutorial_where": ("Where the actuator subsystem fails",),
+    },
+    f"extend {EXAMPLE} --effect valve_dead_band --effect aero_load --out extended.toml": {
+        "tutorial_falls": ("How the error falls",),
+    },
+}  # fmt: skip
 
 WIDE = {"width": 1280, "height": 860}
 
@@ -73,11 +93,55 @@ FLEET = ROOT / "out" / "fleet"  # a run of `vaneloop fleet`, for its picture
 
 def take(folder: Path) -> list[Path]:
     """Take every picture; return the files."""
-    out = _take(folder, ROOT / "examples", WORK)
+    out = [*_reports(folder), *_take(folder, ROOT / "examples", WORK)]
     if not (FLEET / "run.json").is_file():
         print(f"no picture of a fleet: {FLEET} is no run; docs/fleet.md says how one is made")
         return out
     return out + _take(folder, FLEET.parent, (("fleet", "fleet", fleet),))
+
+
+def _reports(folder: Path) -> list[Path]:
+    """Take pictures of figures of the commands' pages, and write what their bars say."""
+    from playwright.sync_api import sync_playwright
+
+    out, said = [], {}
+    with tempfile.TemporaryDirectory() as own, sync_playwright() as p:
+        browser = p.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
+        page = browser.new_page(viewport=WIDE, color_scheme="light", reduced_motion="reduce")
+        page.set_default_timeout(PATIENCE)
+        for line, pictures in REPORTS.items():
+            words = [str(ROOT / w) if w.startswith("examples/") else w for w in shlex.split(line)]
+            words = [sys.executable, "-m", "vaneloop", *words, "--quiet", "--report", f"{own}/page.html"]
+            done = subprocess.run(words, cwd=own, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False)
+            if done.returncode not in (0, 1):
+                raise RuntimeError(f"vaneloop {line}: exit code {done.returncode}")
+            page.goto(Path(own, "page.html").as_uri())
+            page.wait_for_function(DRAWN)
+            for name, captions in pictures.items():
+                all_figures = page.locator("figure")
+                figures = [
+                    all_figures.nth(c) if isinstance(c, int) else all_figures.filter(has_text=c).first for c in captions
+                ]
+                figures[0].scroll_into_view_if_needed()
+                boxes = [f.bounding_box() for f in figures]
+                top, left = page.evaluate("[scrollY, scrollX]")
+                first, last = boxes[0], boxes[-1]
+                clip = {
+                    "x": first["x"] + left, "y": first["y"] + top, "width": first["width"],
+                    "height": last["y"] + last["height"] - first["y"],
+                }  # fmt: skip
+                out.append(folder / f"{name}.png")
+                page.screenshot(path=str(out[-1]), full_page=True, clip=clip)
+                bars = [t for f in figures for t in f.locator(".bartext, .annotation-text").all_text_contents() if t]
+                names = [t for f in figures for t in f.locator(".xtick text").all_text_contents()]
+                if bars:
+                    said[out[-1].name] = {"bars": bars, "axis": names}
+        browser.close()
+    out.append(write(folder / FIGURES, json.dumps(said, indent=1, ensure_ascii=False) + "\n"))
+    return out
+
+
+DRAWN = "[...document.querySelectorAll('.plot')].every((p) => p.querySelector('.main-svg'))"
 
 
 def _take(folder: Path, served: Path, scenes: Sequence[tuple[str, str, Callable[[Any], None]]]) -> list[Path]:

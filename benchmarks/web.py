@@ -66,16 +66,20 @@ def long_log(path: Path) -> None:
     pq.write_table(pa.table(columns), path)
 
 
+def chromium() -> str:
+    """The path of a Chromium; RuntimeError without one."""
+    found = next((p for p in (shutil.which(n) for n in ("chromium", "chromium-browser", "google-chrome")) if p), None)
+    if found is None:
+        raise RuntimeError("no chromium on this machine")
+    return found
+
+
 @contextlib.contextmanager
 def workbench(folder: Path) -> Iterator[tuple[Any, str, int]]:
     """A browser, the address of ``vaneloop web``, and the number of its process."""
     from playwright.sync_api import sync_playwright
 
-    chromium = next(
-        (p for p in (shutil.which(n) for n in ("chromium", "chromium-browser", "google-chrome")) if p), None
-    )
-    if chromium is None:
-        raise RuntimeError("no chromium on this machine")
+    browser_path = chromium()
     words = [
         sys.executable,
         "-m",
@@ -93,7 +97,7 @@ def workbench(folder: Path) -> Iterator[tuple[Any, str, int]]:
         assert server.stdout is not None
         url = server.stdout.readline().strip()
         with sync_playwright() as p:
-            browser = p.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+            browser = p.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
             yield browser, url, server.pid
             browser.close()
     finally:

@@ -225,3 +225,10 @@ def test_a_draw_is_the_same_every_time_and_the_groups_are_the_product(tmp_path: 
     (a, b), (c, d) = draw(plan, 2), draw(plan, 2)
     assert np.array_equal(a, c) and np.array_equal(b, d) and a.shape == (16, 2) and b.shape == (8, 2)
     assert [g.name for g in groups(plan)] == ["still.a.x", "still.b.x"]
+
+
+def test_the_plan_of_the_documentation_is_the_example_and_names_files_that_are_there() -> None:
+    text = (ROOT / "docs" / "campaigns.md").read_text(encoding="utf-8")
+    plan = ROOT / "examples" / "campaign" / "plan.toml"
+    assert plan.read_text(encoding="utf-8") == text.split("```toml\n")[1].split("```")[0]
+    assert (plan.parent / "angle.toml").is_file()

@@ -10,6 +10,7 @@ be there.
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
 import runpy
 import shlex
@@ -241,6 +242,16 @@ def test_every_link_leads_to_a_file_of_the_checkout(page: str) -> None:
     text = re.sub(r"^```.*?^```", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.S | re.M)
     links = [x for x in re.findall(r"\]\(([^)\s]+)\)", text) if not re.match(r"https?:|#|mailto:", x)]
     assert [x for x in links if not ((ROOT / page).parent / x.split("#")[0]).exists()] == []
+
+
+def test_the_first_picture_shows_the_figures_that_the_command_prints() -> None:
+    """The tutorial quotes the line, and is held against what `extend` prints."""
+    text = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    printed = re.search(r"^actuator, in noise floors: (.*)$", text, re.M)
+    assert printed
+    shown = json.loads((ROOT / "docs" / "pictures" / "figures.json").read_text(encoding="utf-8"))["tutorial_falls.png"]
+    said = [f"{name} {bar}" for name, bar in zip(shown["axis"], shown["bars"], strict=True)]
+    assert " -> ".join(said) == printed[1]
 
 
 def test_the_pages_hold_what_this_test_is_for() -> None:
