@@ -87,6 +87,8 @@ NOT_RUN: dict[str, str] = {
     "make test": "runs this test",
     "vaneloop run --bus vcan0": VCAN,
     "vaneloop ecu --bus vcan0": VCAN,
+    "vaneloop run --xcp": "runs until Ctrl-C; tests/test_xcp.py",
+    "vaneloop run --uds": "runs until Ctrl-C; tests/test_uds.py",
     "vaneloop record run.mf4 --bus vcan0": VCAN,
     "vaneloop record night.mf4 --bus vcan0": VCAN,
     "candump vcan0": VCAN,
@@ -534,3 +536,12 @@ def test_a_long_page_runs_and_what_takes_long_of_the_others(
     page: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     run_page(page, tmp_path, request, long=True)
+
+
+def test_what_is_run_in_real_time_ends_by_itself() -> None:
+    """A command that runs until Ctrl-C would stand in the way of all other tests."""
+    live = ("vaneloop run", "vaneloop ecu", "vaneloop record")
+    run = [(page, replaced(page, s.text)) for page in PAGES for s in ALL[page] if not skipped(page, s, True)]
+    ends = ("--duration", "--bus lockstep")
+    endless = [f"{page}: {text}" for page, text in run if text.startswith(live) and not any(e in text for e in ends)]
+    assert not endless, f"state a --duration, or enter it in NOT_RUN with its reason: {endless}"

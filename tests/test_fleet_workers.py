@@ -53,7 +53,7 @@ class Readings:
         self.words, self.stopped = (function, folder), stopped
         return self
 
-    def ask(self, path: str, options: dict[str, Any], limit: float) -> dict[str, Any]:
+    def ask(self, path: str, options: dict[str, Any], limit: float, beside: Any = ()) -> dict[str, Any]:
         self.asked.append(Path(path).name)
         self.limits.add((json.dumps(options), limit))
         left = self.says.get(Path(path).name, [])
@@ -479,7 +479,8 @@ def test_a_reader_has_its_process_compile_first_and_asks_it_log_by_log(
 
     monkeypatch.setattr(reader, "select", SimpleNamespace(select=wait))
     assert r.ask("/a", {"x": 1}, 60.0) == {"status": "done"} and r.ask("/b", {"x": 1}, 60.0) == {"b": 2}
-    assert p.got == [{"options": {"x": 1}}, {"path": "/a", "options": {"x": 1}}, {"path": "/b", "options": {"x": 1}}]
+    asked = [{"path": path, "options": {"x": 1}, "beside": []} for path in ("/a", "/b")]
+    assert p.got == [{"options": {"x": 1}}, *asked]
     ((words, more),) = begun
     assert words[0] == sys.executable and words[1:3] == ["-P", "-c"] and words[4:] == ["one", "/run"]
     assert "serve()" in words[3]

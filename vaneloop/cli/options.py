@@ -263,7 +263,7 @@ def log_options(args: argparse.Namespace, source: str | None = None) -> dict[str
         "design_rpm": args.design_rpm,
         "guess": not args.no_guess,
         "mapping_file": args.mapping,
-        "part": args.part or 0,
+        **({"part": args.part} if args.part else {}),
         **({"tables": files_of(args.tables)} if getattr(args, "tables", None) else {}),
     }
 
