@@ -22,7 +22,7 @@ from hil import inject, native
 from hil.bus import wire
 from hil.bus.frames import EXTENDED, REMOTE
 from hil.bus.lockstep_bus import run_lockstep
-from hil.inject import Check, Expect, Outcome, Scenario, Trace, injection, judge, sil
+from hil.inject import Check, Expect, Outcome, Scenario, Trace, injection, judge, on_lockstep, sil
 from hil.inject.actions import ACTIONS, identifier, raw_signal
 from hil.inject.any_controller import Reactions, expected_of_any, load_reactions
 from hil.inject.margin import Margin, margins
@@ -1474,7 +1474,7 @@ def test_supply_and_effects_change_from_the_first_tick_on_until_the_end_and_are_
     action = inject.Machine(
         p_s=5.0, t_oil=80.0, effect="lvdt_bias", parameters={"bias": 2.0}, start=0.003, duration=0.004
     )
-    change = injection.MachineChange(action, node, ecu)
+    change = on_lockstep.MachineChange(action, node, ecu)
     assert (change.first, change.end) == (3, 7)
     seen = []
     for k in range(9):
@@ -1488,7 +1488,7 @@ def test_supply_and_effects_change_from_the_first_tick_on_until_the_end_and_are_
 def test_what_a_machine_action_does_not_name_stays(keys: dict[str, float], supply: tuple[float, float]) -> None:
     node, ecu = Node(), Ecu()
     p = node.loop.p.copy()
-    change = injection.MachineChange(inject.Machine(**keys), node, ecu)
+    change = on_lockstep.MachineChange(inject.Machine(**keys), node, ecu)
     change.tick(0)
     change.tick(1)
     assert tuple(node.arrays.supply[:2]) == supply and np.array_equal(node.loop.p, p)
@@ -1499,7 +1499,7 @@ def test_an_effect_of_a_stage_that_the_machine_lacks_is_refused() -> None:
     with pytest.raises(
         InputError, match=r"^parameters\.vgv7 of pot_bias: this machine has the vane rows vigv, vgv1, vgv2$"
     ):
-        injection.MachineChange(action, Node(), Ecu())
+        on_lockstep.MachineChange(action, Node(), Ecu())
 
 
 def wire_of_two(now: int = 0, free: int = 0) -> Any:
@@ -1513,7 +1513,7 @@ def disturbed(ticks: int, *actions: Any) -> list[tuple[float, np.ndarray]]:
     """The chance of an error and the nodes' state at each tick: two nodes, of which the second has 3 frames waiting."""
     bus = wire_of_two()
     bus.node[1, wire.TX_N] = 3
-    disturber = injection.Disturber(actions, bus, {"ECU": 0, "VGV": 1})
+    disturber = on_lockstep.Disturber(actions, bus, {"ECU": 0, "VGV": 1})
     out = []
     for k in range(ticks):
         disturber.tick(k)
@@ -1554,7 +1554,7 @@ def test_what_the_wire_was_free_before_does_not_count_for_the_recovery(now: int,
     """The wire counts 11 recessive bits from where it became free."""
     for k, action in ((0, inject.BusOff()), (5, inject.BusOff(duration=0.005))):
         bus = wire_of_two(now, free)
-        disturber = injection.Disturber([action], bus, {"ECU": 0, "VGV": 1})
+        disturber = on_lockstep.Disturber([action], bus, {"ECU": 0, "VGV": 1})
         disturber.tick(0)
         disturber.tick(k)
         assert bus.node[0, wire.TO_RECOVER] == times
@@ -1562,7 +1562,7 @@ def test_what_the_wire_was_free_before_does_not_count_for_the_recovery(now: int,
 
 def test_a_disturber_is_over_with_the_last_of_its_actions() -> None:
     def end(*actions: Any) -> float:
-        return injection.Disturber(actions, wire_of_two(), {"ECU": 0, "VGV": 1}).end
+        return on_lockstep.Disturber(actions, wire_of_two(), {"ECU": 0, "VGV": 1}).end
 
     assert end() == end(inject.Drop(start=5.0, duration=1.0)) == 0.0
     assert end(inject.ErrorFrames(duration=0.5), inject.BusOff(start=1.0, duration=0.25)) == 1250
@@ -1583,8 +1583,8 @@ def test_a_node_back_from_bus_off_is_heard_again() -> None:
 
 
 def test_whose_frames_an_action_works_on_is_told_by_their_name() -> None:
-    assert injection.sender_of(inject.Drop()) == "ECU"
-    assert {injection.sender_of(inject.Drop(frame=f)) for f in ("VGV_STATUS", 0xB5, "0xB3")} == {"VGV"}
+    assert on_lockstep.sender_of(inject.Drop()) == "ECU"
+    assert {on_lockstep.sender_of(inject.Drop(frame=f)) for f in ("VGV_STATUS", 0xB5, "0xB3")} == {"VGV"}
 
 
 # ---- one station among others ----------------------------------------------------------------------------------------

@@ -77,9 +77,9 @@ def test_a_log_gives_its_demand_and_its_speed_where_it_has_one() -> None:
     np.testing.assert_allclose(d.t, [0.0, 0.02, 0.04])
     speed = Channel(np.array([5.01, 5.03]), np.array([50.0, 51.0]))
     d = demand_of_log(Log("run.csv", {"n_dem": dem, "n_r": speed}))
-    np.testing.assert_allclose(d.t, [0.0, 0.01, 0.02, 0.03, 0.04], atol=1e-12)
-    assert d.n_dem.tolist() == [60.0, 60.0, 61.0, 61.0, 62.0]
-    assert d.n_r is not None and d.n_r.tolist() == [50.0, 50.0, 50.0, 51.0, 51.0]
+    np.testing.assert_allclose(d.t, [0.0, 0.01, 0.02, 0.03], atol=1e-12)  # from where both have begun
+    assert d.n_dem.tolist() == [60.0, 61.0, 61.0, 62.0]
+    assert d.n_r is not None and d.n_r.tolist() == [50.0, 50.0, 51.0, 51.0]
 
 
 def profile(folder: Path, text: str) -> Demand:
@@ -671,7 +671,7 @@ def test_what_is_one_for_all_or_one_for_each() -> None:
 def test_a_block_begins_with_a_line_of_the_cache() -> None:
     kinds = [np.dtype([("a", np.float64, (n,))]) for n in (1, 3, 17)]
     for kind in kinds:
-        block = lanes._aligned(kind)
+        block = lanes.aligned(kind)
         assert block.ctypes.data % 64 == 0 and block.shape == (1,) and not block["a"].any()
 
 

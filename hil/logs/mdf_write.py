@@ -18,7 +18,7 @@ from hil.logs.bus_log import encode_channels
 from hil.logs.frames import Frames
 from hil.logs.record_formats import ERROR, FD, NOTE_CHANNEL, REMOTE, append_whole
 from hil.logs.source import Channel, LogError
-from vaneloop.base.files import whole, write
+from vaneloop.base.files import whole
 from vaneloop.base.signals import UNITS
 
 __all__ = ["MdfRecord", "write_bus", "write_groups", "write_mdf", "write_mdf3"]
@@ -44,10 +44,10 @@ def _rasters(channels: dict[str, Channel]) -> list[tuple[np.ndarray, dict[str, t
 
 def write_mdf3(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
     """Channel groups of MDF 3.30, one per raster."""
-    with tempfile.TemporaryDirectory() as own, asammdf.MDF(version="3.30") as mdf:
+    with whole(path, LogError) as part, tempfile.TemporaryDirectory() as own, asammdf.MDF(version="3.30") as mdf:
         _append(mdf, _rasters(channels))
         mdf.save(file := Path(own) / "log.mdf")  # a file of its own: asammdf writes MDF 3 into no other
-        write(path, file.read_bytes())
+        part.write_bytes(file.read_bytes())
 
 
 def _append(mdf: Any, groups: list[tuple[np.ndarray, dict[str, tuple[np.ndarray, str]]]]) -> None:

@@ -33,6 +33,7 @@ class Reading(Table):
     units: dict[str, str] = {}
     design_rpm: Finite | None = None
     guess: StrictBool = True
+    part: Annotated[int, Field(ge=0)] = 0
 
 
 class _Diagnosis(Options):
