@@ -116,6 +116,8 @@ NOT_RUN: dict[str, str] = {
     "python -m benchmarks.fleet_demo": "simulates the logs of many engines; tests/test_fleet_report.py",
     "python -m benchmarks.hidden_effect": "draws and diagnoses logs for an hour; tests/test_hidden_effect.py",
     "python -m benchmarks.hidden_law": "draws and diagnoses systems for an hour; tests/test_hidden_law.py",
+    "python -m benchmarks.campaign": "measures for minutes; no test judges time",
+    "python -m tests.corpus.make": "overwrites tests/corpus; tests/test_corpus.py compares it",
     "python -m benchmarks.gpu": "measures on an NVIDIA GPU; tests/test_gpu.py",
     "python -m benchmarks.settings": "overwrites docs/settings.md; tests/test_settings.py compares it",
     "vaneloop campaign": "runs for minutes, on workers; tests/test_campaign.py",
