@@ -226,3 +226,15 @@ def test_an_effect_whose_interval_holds_its_neutral_size_is_not_there(value: flo
     after = replace(c.after, effects=("e",), theta=theta, free=np.arange(2), low=ends[0], high=ends[1])
     verdict = rules.AWAY.verdict(replace(c, after=after))
     assert verdict.holds == (not value - low < 0.5 < value + high) or abs(verdict.value - 1.0) < 1e-9
+
+
+def test_of_two_limits_one_that_is_reached_is_enough() -> None:
+    """A saturation has a limit on either side; that which the log never reaches stands at neutral, without an interval."""
+    c = comparison([40.0] * BLOCKS, [1.0] * BLOCKS)
+    limits = (Parameter("low", -15.0, "deg"), Parameter("high", np.inf, "deg"))
+    effect = SimpleNamespace(parameters=limits)
+    c.judge.stage = SimpleNamespace(index=lambda: {"e": slice(0, 2)}, effect=lambda _: effect)
+    for high, there in ((3.78, True), (np.inf, False)):
+        theta = np.array([-15.0, high])
+        after = replace(c.after, effects=("e",), theta=theta, free=np.arange(2), low=theta - [0.0, 0.1], high=theta)
+        assert rules.AWAY.verdict(replace(c, after=after)).holds == there

@@ -221,7 +221,10 @@ class Comparison:
             k = int(np.flatnonzero(fit.free == at + i)[0])
             value, neutral = float(fit.theta[at + i]), p.value
             half = value - float(fit.low[k]) if neutral < value else float(fit.high[k]) - value
-            found.append(abs(value - neutral) / half if half > 0.0 else np.inf * abs(value - neutral))
+            if value == neutral:  # of two limits one that nothing reaches stays there
+                found.append(0.0)
+            else:
+                found.append(abs(value - neutral) / half if half > 0.0 else np.inf)
         return max(found, default=np.inf)
 
     def _levels(self, fit: Fit, least: float = 1.0) -> Array:
