@@ -162,9 +162,8 @@ def mapped() -> tuple[Record, System]:
 @pytest.mark.parametrize("made", [mapped, oscillator, cascaded])
 def test_compare_shows_the_error_that_diagnose_starts_from(made: Any) -> None:
     log, system = made()
-    compared, found, extended = (
-        vaneloop.compare(log, system), vaneloop.diagnose(log, system), vaneloop.extend(log, [], system),
-    )  # fmt: skip
+    compared, found = vaneloop.compare(log, system), vaneloop.diagnose(log, system)
+    extended = vaneloop.extend(log, [found.diagnosis.stages[0].candidates[0].effect], system)
     assert before(compared) == before(found) == before(extended)
     of = [list(a.by_log.steps["model"].values())[0].tolist() for a in (compared, found, extended) if a.by_log]
     assert of[0] == of[1] == of[2]

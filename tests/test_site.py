@@ -120,7 +120,7 @@ SEARCHES = {
     ".mf4": "logs", ".blf": "logs", ".parquet": "logs", ".a2l": "xcp", ".fmu": "fmu", ".dbc": "logs",
     "export-fmu": "reference/commands/export-fmu", "new-controller": "reference/commands/new-controller",
     "least squares": "methods", "hysteresis": "effects", "Simulink": "coming_from_simulink",
-    "CAPL": "coming_from_canoe", "vaneloop.diagnose": "diagnos",
+    "CAPL": "coming_from_canoe", "vaneloop.diagnose": "reference",
 }  # fmt: skip
 # pages of every kind, which are held against axe-core
 PAGES = ("index", "diagnosis", "settings", "notebooks/missing_physics", "reference/commands/run", "reference/python")

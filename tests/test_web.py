@@ -602,7 +602,8 @@ def test_every_report_is_open_to_phone_and_screen_reader(browser: Any, tmp_path:
     extended = vaneloop.extend(log, ["valve_dead_band", "aero_load"])
     parts = extended.diagnosis, extended.bound, "vaneloop", str(log)
     t = np.arange(100.0)
-    experiment = {"text": "Ramp it.", "t": t, "n_dem": t}
+    row = {"profile": "ramp", "nats": 30.0, "spreads": 4.0, "repeats": 1}
+    experiment = {"text": "Ramp it.", "t": t, "n_dem": t, "separates": True, "table": [row]}
     reports = {
         "locate": vaneloop.locate(log).page(),
         "replay": vaneloop.replay(vaneloop.read_log(log)).page(),
