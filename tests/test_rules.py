@@ -229,7 +229,7 @@ def test_an_effect_whose_interval_holds_its_neutral_size_is_not_there(value: flo
 
 
 def test_of_two_limits_one_that_is_reached_is_enough() -> None:
-    """A saturation has a limit on either side; one that the log never reaches stands at neutral, without an interval."""
+    """A saturation has two limits; one that the log never reaches stands at neutral, without an interval."""
     c = comparison([40.0] * BLOCKS, [1.0] * BLOCKS)
     limits = (Parameter("low", -15.0, "deg"), Parameter("high", np.inf, "deg"))
     effect = SimpleNamespace(parameters=limits)
