@@ -177,14 +177,14 @@ class RelativeErrorAcceptance:
         return self._harmless_together(search, fit)
 
     def _harmless_together(self, search: Search, fit: Fit) -> Fit:
-        """The model without any effect where all of them together make a log worse: taken out one at a time, each may
-        look needed to make up for another.
+        """The model without any effect where all of them together make a validation log worse: taken out one at a time,
+        each may look needed to make up for another.
         """
         if self.figures is None or not fit.effects:
             return fit
         base, with_them = self.figures(search.base.theta), self.figures(fit.theta)
         change = {log: with_them[log] - v for log, v in base.items() if log in with_them}
-        case = LogChanges(change, frozenset(change))
+        case = LogChanges(change, self.tests)
         if self.decisions.decide([HARMS_NONE], case, fit.effects, ()):
             return fit
         named = " + ".join(fit.effects)
