@@ -258,3 +258,11 @@ def test_a_package_reaches_a_process_of_its_own(rig: Path, tmp_path: Path) -> No
         check=True,
     )  # fmt: skip
     assert "n_dem" in done.stdout
+
+
+def test_what_is_written_is_told_by_its_name_and_not_by_the_file_that_was_there(tmp_path: Path) -> None:
+    """A table in place of frames in CSV: the old file's beginning says nothing of the new one."""
+    file = tmp_path / "a.csv"
+    file.write_text("Time Stamp,ID,Extended,Dir,Bus,LEN,D1\n0,00000122,false,Rx,0,1,74\n")
+    write_log(file, {"n_dem": Channel(T, SPEED)})
+    np.testing.assert_allclose(read_log(file).channels["n_dem"].values, SPEED)

@@ -20,7 +20,7 @@ import numpy as np
 from hil.logs import plausible
 from hil.logs.channels import Channels
 from hil.logs.dataframe import frame_columns, is_frame, name_of, open_frame
-from hil.logs.formats import format_at
+from hil.logs.formats import format_at, format_of
 from hil.logs.guess import Files, Guess
 from hil.logs.joined import joined, seems_joined
 from hil.logs.notes import MOST_ROWS, Note
@@ -534,7 +534,7 @@ def write_log(path: str | Path, channels: dict[str, Channel], *, dbc: str | Path
     LogError for a name that is no signal, a channel that is not one, a value that its frame cannot hold.
     """
     path = Path(path)
-    of = format_at(path)
+    of = format_of(path)
     if not channels:
         raise LogError(f"{path}: no channel to write")
     checked = {}
