@@ -202,17 +202,11 @@ def locate(judge: LeastSquaresProblem, fit: Fit | None = None) -> Located:
     as_given = np.sqrt(np.sum(given * given, axis=1) / np.maximum(n, 1)) * judge.floor
     signals = tuple(
         StageFigures(
-            stage.name,
-            signal,
-            stage.units[k],
-            float(rms[k]),
-            float(as_given[k]),
-            float(judge.floor[k]),
-            int(n[k]),
+            stage.name, signal, stage.units[k], float(rms[k]), float(as_given[k]), float(judge.floor[k]), int(n[k]),
             tolerance(int(n[k]), colour),
-        )  # fmt: skip
+        )
         for k, signal in enumerate(stage.outputs)
-    )
+    )  # fmt: skip
     found = tuple(regimes(judge, fit, colour))
     start = onset(judge, fit) if any(r.significant.any() for r in found) else None
     return Located(stage.name, fit, judge.floor, signals, found, start)

@@ -219,12 +219,13 @@ class LikelihoodAcceptance:
             )
             if not decide(NAMED, case, current.effects, tuple(e for e in current.effects if e != f.effect)):
                 refused[f.effect] = f"would have to turn on {f.other_cause}" if f.other_cause else BOUND
-        if not decide([EXPLAINS_HALF], left := self._left_by(base, current), current.effects, ()):
+        left = self._left_by(base, current)
+        if not decide([EXPLAINS_HALF], left, current.effects, ()):
             refused = dict.fromkeys(
                 current.effects, f"explains {max(left.explained, 0.0):.0%} of what exceeds the noise"
             )
-            effects, current = [], base
-        little = decide(LEAVES_LITTLE, self._left_by(base, current), current.effects, ())
+            effects, current, left = [], base, self._left_by(base, base)
+        little = decide(LEAVES_LITTLE, left, current.effects, ())
         if not little or (refused and current.effects):
             verdict, effects = "unknown", []
         elif current.effects:

@@ -21,7 +21,7 @@ A number that is not finite never meets a limit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
@@ -418,12 +418,9 @@ IS_OF_USE = Rule[LogChanges](
     applies=lambda c: bool(c.change),
 )  # fmt: skip
 OTHER_LOGS = (HARMS_NONE, IS_OF_USE)
-SUITS_ALL = Rule[LogChanges](
-    "other subsystems", "log error",
-    "What acts in several subsystems must suit all of them.",
-    lambda c: c.change[c.worst] if c.worst is not None else -np.inf, lambda _: HARM, at_most=True,
-    applies=lambda c: c.worst is not None,
-)  # fmt: skip
+SUITS_ALL = replace(
+    HARMS_NONE, name="other subsystems", reason="What acts in several subsystems must suit all of them."
+)
 
 
 # ---- names, and what the whole set leaves ----------------------------------------------------------------------------
