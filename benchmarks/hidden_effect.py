@@ -30,6 +30,7 @@ from benchmarks.blind import (
     run,
     share,
 )
+from benchmarks.loggers import draw, recorded
 from benchmarks.same_curve import as_a_curve
 from hil.logs import Channel, read_log, write_log
 from hil.loop.lockstep import warm_up
@@ -62,6 +63,7 @@ examples:
   python -m benchmarks.hidden_effect --logs 200 --seed 12345 --out out/blind.parquet  (continues where it was stopped)
   python -m benchmarks.hidden_effect --logs 60 --kinds outside clean --learn --out out/learned.parquet
   python -m benchmarks.hidden_effect --logs 40 --leave-out --out out/left_out.parquet
+  python -m benchmarks.hidden_effect --logs 40 --loggers --out out/loggers.parquet
   python -m benchmarks.hidden_effect --plant tables/plant_electromechanical.toml --out out/motor.parquet
 
 exit codes: 0 done, 2 bad input. The figures are for reading; no threshold decides."""
@@ -80,6 +82,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, metavar="S", help="seed of the draw (default: fresh, and printed)")
     parser.add_argument("--duration", type=float, default=300.0, metavar="S", help="length of each log (default 300 s)")
     parser.add_argument("--rate", type=int, default=100, choices=(10, 100, 1000), help="rows a second (default 100)")
+    parser.add_argument(
+        "--loggers",
+        action="store_true",
+        help="every log is taken by an ordinary recorder of its own: rate, filter, clocks, last digit, hum, stale rows",
+    )
     parser.add_argument(
         "--experiments",
         action="store_true",
@@ -284,16 +291,18 @@ def _experiment(d: Any, chain: Any, case: dict[str, Any], test: Any, stages_of: 
 
 def judge_case(
     seed: int, index: int, duration: float, rate: int, experiments: bool = False, machine: str = "hydraulic",
-    learn: bool = False, kinds: Sequence[str] = KINDS, leave_out: bool = False,
+    learn: bool = False, kinds: Sequence[str] = KINDS, leave_out: bool = False, loggers: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Simulate, write, diagnose and score one log of a ``machine`` of `MACHINES`; a flat record."""
     case = draw_case(seed, index, duration, machine, kinds, leave_out)
     plant, motor = build_plant(MACHINES[machine]), machine == "electromechanical"
     test = rig.manoeuvre(case["machine_seed"], duration)
+    logger = draw(np.random.default_rng([seed, index, 1])) if loggers else None
 
     def stages_of(hidden: list[Any], test: Any = test) -> Any:
         run = rig.simulate(
-            test, firmware(), hidden, seed=case["machine_seed"], rate=rate, geometry=case["geometry"],
+            test, firmware(), hidden, seed=case["machine_seed"], rate=1000 if logger else rate,
+            geometry=case["geometry"],
             gaps=case["gaps"],
             spells=case["modes"],
             motor=motor,
@@ -301,7 +310,13 @@ def judge_case(
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "log.parquet"
             without = ("t", "p_s") if motor else ("t",)  # there is no oil
-            write_log(path, {k: Channel(run.log["t"], v) for k, v in run.log.items() if k not in without})
+            log = {k: v for k, v in run.log.items() if k not in without}
+            channels = (
+                recorded(log, logger, np.random.default_rng([seed, index, 2]))
+                if logger
+                else {k: Channel(run.log["t"], v) for k, v in log.items()}
+            )
+            write_log(path, channels)
             return build_chain(read_log(path, require=()), plant)
 
     chain = stages_of(case["hidden"])
@@ -354,6 +369,7 @@ def judge_case(
         "sizes": json.dumps([dict(h.parameters) for h in case["hidden"]]),
         "geometry": json.dumps(asdict(case["geometry"])),
         "gaps": json.dumps(case["gaps"]), "modes": json.dumps([asdict(s) for s in case["modes"]]),
+        "logger": json.dumps(asdict(logger) if logger else None),
         "detectable": detectable, "verdict": answer["verdict"], "named": named, "rivals": json.dumps(rivals),
         "probabilities": [e["probability"] for e in answer["effects"]],
         "unknown_stages": [u["stage"] for u in answer["unknown"]], "shapes": [u["shape"] for u in answer["unknown"]],
@@ -603,7 +619,7 @@ def command(args: argparse.Namespace) -> int:
         )
     run(
         args, "logs", args.logs, rows, path, judge_case, seed, args.duration, args.rate, args.experiments, machine,
-        args.learn, tuple(k for k in KINDS if k in args.kinds), args.leave_out,
+        args.learn, tuple(k for k in KINDS if k in args.kinds), args.leave_out, args.loggers,
     )  # fmt: skip
     s = summary(rows)
     spent = f"{s['median seconds']:.1f} s a diagnosis"

@@ -49,7 +49,7 @@ def test_a_fast_log_is_put_on_the_controllers_frame_wherever_it_begins(fast: dic
 
 def test_a_current_sampled_at_the_rows_is_known_as_such_and_nothing_is_missing(fast: dict[str, np.ndarray]) -> None:
     chain = chain_of(fast, slice(None, None, 10))
-    assert any("i_cmd: the current of the tick at each row" in n for n in chain.notes)
+    assert any("i_cmd: the current at single ticks" in n for n in chain.notes)
     for name in ("demand", "servo", "actuator"):
         assert said(chain, name).verdict == "none", name
 

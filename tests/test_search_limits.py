@@ -364,7 +364,7 @@ def first_of_eight_bins_beyond(chance: float, correlation: float) -> Any:
     squares[:n] = 1.0 + float(norm.isf(chance / 8)) * np.sqrt(2.0 * correlation / n)
     stage = SimpleNamespace(
         name="s", t=np.arange(8.0 * n), outputs=("y",), units=("mm",), regimes={"u": np.arange(8.0 * n)},
-        regime_units={}, neutral=lambda: np.zeros(1), lost=None,
+        regime_units={}, neutral=lambda: np.zeros(1), lost=None, raster_error=None,
     )  # fmt: skip
     white = np.sqrt(squares) * np.where(np.arange(8 * n) % 2, 1.0, -1.0)  # no neighbour is alike
     return SimpleNamespace(
@@ -401,6 +401,17 @@ def test_a_level_that_is_noise_everywhere_is_no_matter_of_one_bin() -> None:
     assert not any(r.significant.any() for r in locate.regimes(judge, AT_NOTHING, 2.0))
     e[..., :500] *= 1.4  # one bin beyond the others is told all the same
     assert locate.regimes(judge, AT_NOTHING, 2.0)[0].significant[0]
+
+
+@pytest.mark.parametrize(("error", "share", "significant"), [(1.9, 1.0, True), (1.4, 1.0, False), (1.4, 0.0, True)])
+def test_what_the_raster_hides_is_known_to_half_of_it(error: float, share: float, significant: bool) -> None:
+    """``share`` of the floor is the raster's: as far as that may be wrong, a bin does not fail."""
+    judge = first_of_eight_bins_beyond(0.5, 1.0)
+    judge.stage.raster_error = np.full(1, share)
+    e = np.random.default_rng(3).standard_normal((1, 1, 4000))
+    e[..., :500] *= error
+    judge.errors = lambda _: e
+    assert bool(locate.regimes(judge, AT_NOTHING, 1.0)[0].significant[0]) == significant
 
 
 @given(seed=st.integers(0, 10_000), band=st.floats(0.5, 3.0))

@@ -27,6 +27,7 @@ from hil.logs.notes import MOST_ROWS, Note
 from hil.logs.opening import Opened, is_ours, open_log, sketch, wanted_design_speed
 from hil.logs.scale import proposed_scale
 from hil.logs.source import ABSENT, Channel, LogError, Options, Series, Source, close_names, find, is_absent
+from hil.logs.stale import stale_rows
 from hil.logs.table import NoTime, split_unit
 from hil.logs.units import UnitError, Units
 from vaneloop.base.errors import meant
@@ -392,7 +393,7 @@ def read_log(
             line = f"{path}: {found} {signal}: {asked}; --map NAME={signal} names another{source.has()}"
             raise LogError("; ".join(filter(None, (line, log.unused))))
     _refuse_units(path, wrong)
-    channels = _own_samples(_one_run(path, channels, require, notes), notes)
+    channels = _own_samples(_fresh(_one_run(path, channels, require, notes), notes), notes)
     _shift(channels, notes, "1900" if units.get("t") == "day" else "1970")
     ours = {name: (c.t, c.values) for name, c in channels.items() if is_ours(name, signals)}
     sure, perhaps = plausible.too_small(ours, set(units) - set(log.guesses.made))
@@ -470,6 +471,31 @@ def _one_run(
             out[name] = replace(c, t=c.t[use], values=c.values[use])
         if name in require and np.count_nonzero(use) < 2:
             raise LogError(f"{path}: no {name} in the part of the log that is kept ({note})")
+    return out
+
+
+def _fresh(channels: dict[str, Channel], notes: list[str]) -> dict[str, Channel]:
+    """Channels without the rows that only repeat the row before (`hil.logs.stale`)."""
+    tables: list[list[str]] = []
+    for name, c in channels.items():
+        if not c.framed:
+            table = next((names for names in tables if np.array_equal(channels[names[0]].t, c.t)), None)
+            if table is None:
+                tables.append([name])
+            else:
+                table.append(name)
+    out = dict(channels)
+    for names in tables:
+        stale = stale_rows([channels[n].values for n in names]) if len(names) > 1 else np.zeros(0, dtype=bool)
+        if not stale.any():
+            continue
+        t = channels[names[0]].t[stale]
+        many = int(np.count_nonzero(stale))
+        notes.append(Note(f"{', '.join(names)}: {many:,} of {stale.size:,} rows repeat the row before in every channel "
+                          f"(the first at {t[0]:.6g} s): stale, left out", "left out", "time", many))  # fmt: skip
+        for n in names:
+            c = channels[n]
+            out[n] = replace(c, t=c.t[~stale], values=c.values[~stale])
     return out
 
 

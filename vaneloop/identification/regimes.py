@@ -16,7 +16,7 @@ from vaneloop.base.compiled import compiled
 from vaneloop.identification.least_squares.noise import colour_of, most_floor, tolerance
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
 from vaneloop.identification.results import rms_per_output
-from vaneloop.identification.settings import AGREES, COLOUR, NOISE_KNOWN_TO, REGIME_BINS, REGIME_LEVEL, SHAPE_TOLD
+from vaneloop.identification.settings import AGREES, COLOUR, RASTER_KNOWN_TO, REGIME_BINS, REGIME_LEVEL, SHAPE_TOLD
 from vaneloop.identification.subsystem import Array, without_jumps
 
 __all__ = [
@@ -232,9 +232,8 @@ def regimes(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> list[Re
     """
     e, lost = judge.errors(fit.theta[None])[0], judge.lost()
     stage = judge.stage
-    known = (
-        (1.0 + NOISE_KNOWN_TO) ** 2 if stage.lost is not None else 1.0
-    )  # drawn floors are as uneven as that is known
+    raster = np.zeros(len(stage.outputs)) if stage.raster_error is None else (stage.raster_error / judge.floor) ** 2
+    known = 1.0 + np.minimum(raster, 1.0) * ((1.0 + RASTER_KNOWN_TO) ** 2 - 1.0)
     raw = []
     looks, blocks = 0, len(judge.block_start)
     block_of = np.repeat(np.arange(blocks), np.diff(judge.block_start, append=e.shape[1]))
@@ -259,7 +258,7 @@ def regimes(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> list[Re
         # what all other bins have, too, is no matter of this one, as far as the floor may be wrong
         total, squares, expected = (v.sum() - v.sum(axis=1) for v in sums)
         elsewhere = squares / np.maximum(np.maximum(expected, total), 1.0)
-        of_noise = np.maximum(known, np.minimum(elsewhere, most_floor(int(sums[0].sum()), correlation) ** 2))
+        of_noise = np.maximum(known[k], np.minimum(elsewhere, most_floor(int(sums[0].sum()), correlation) ** 2))
         hot, n, ms = stands_out(*sums, of_noise, looks, correlation)
         ratio = np.sqrt(ms)
         excess = np.maximum(ms - 1.0, 0.0)

@@ -146,6 +146,12 @@ NOISE_KNOWN_TO = setting(
     "Two estimates of one noise differ by up to this share on a clean log of some 100 s.",
     "benchmark: clean logs",
 )
+RASTER_KNOWN_TO = setting(
+    0.5,
+    "share",
+    "What a log's raster hides is known to this share: half the rows, or draws of what was not logged, tell it.",
+    "benchmark: clean logs of ordinary loggers, in the worst of their bins",
+)
 PIECE_BLOCKS = setting(
     6,
     "blocks",
@@ -298,6 +304,12 @@ EXPLAINED = setting(
     "share",
     "All effects named in a subsystem must explain this share of the excess over the floor together.",
     "judgement: a name that leaves most of the error is none",
+)
+LATE = setting(
+    0.04,
+    "s",
+    "Channels may stand early or late in the file by so much.",
+    "numerics: recorders that are started together, and their filters; beyond it a channel is another run's",
 )
 LEFT_FLOORS = setting(
     3.0,

@@ -37,8 +37,16 @@ from vaneloop.base.vanes import VANES, same_stages
 from vaneloop.identification.settings import CHAIN_MEMORY, CURRENT_DRAWS, LEAST_FLOOR, RASTER, SETTLE
 from vaneloop.identification.subsystem import Array, Stage, noise_of
 from vaneloop.identification.vane_chain.actuator import actuator_stage
+from vaneloop.identification.vane_chain.alignment import aligned, late_in_controller, late_vanes
 from vaneloop.identification.vane_chain.candidates import OF_STROKE, reversals, room_for
-from vaneloop.identification.vane_chain.current import SAMPLED, between_rows, other_current, servo_law, without_noise
+from vaneloop.identification.vane_chain.current import (
+    SAMPLED,
+    SLOW_CURRENTS,
+    between_rows,
+    other_current,
+    servo_law,
+    without_noise,
+)
 from vaneloop.identification.vane_chain.demand import demand_stage, own_demand_stage
 from vaneloop.identification.vane_chain.engine import engine_stage
 from vaneloop.identification.vane_chain.linkage import linkage_stage
@@ -58,6 +66,7 @@ from vaneloop.identification.vane_chain.subsystem_data import Driven
 
 __all__ = ["STAGE_ORDER", "Chain", "build_chain"]
 
+BUS, DELAYS = {"n_dem", "n_r", "x_dem"}, ("can_delay", "frame_hold")  # channels in frames, and what delays frames
 STAGE_ORDER = ("demand", "servo", "engine", "actuator", "linkage")
 
 
@@ -102,13 +111,38 @@ def build_chain(
     pieces: Sequence[tuple[int, int]] = (),
     draws: int = CURRENT_DRAWS,
 ) -> Chain:
-    """Put ``log`` on one raster and make every stage that its channels allow.
+    """Put ``log`` on one raster and make every stage that its channels allow; channels that stand late in the file are
+    moved to where they belong (`alignment`).
 
     present  effects that the model already has: they are part of ``plant`` and not tried again
     grid     of the log, where it is known
     pieces   rows of it, as `on_raster` takes them: the stages of these only
     draws    of what the log hides from the servo
     """
+    chain = _build(log, plant, calibration, present, grid, pieces, draws)
+    said: list[str] = []
+    framed = any(c.framed for c in log.channels.values())  # frames are stamped by one clock
+    for find in () if pieces or framed else (late_in_controller, late_vanes):
+        if late := find(chain.stages):
+            log = aligned(log, late, chain.start)
+            if any(BUS.intersection(one.channels) for one in late):
+                present = (*present, *DELAYS)  # a recorder's lateness and theirs look alike
+            chain = _build(log, plant, calibration, present, None, (), draws)
+            said += [one.text() for one in late]
+    chain.notes += said
+    return chain
+
+
+def _build(
+    log: Log,
+    plant: Plant | None,
+    calibration: Calibration | None,
+    present: tuple[str, ...],
+    grid: Grid | None,
+    pieces: Sequence[tuple[int, int]],
+    draws: int,
+) -> Chain:
+    """`build_chain` with every channel where the file has it."""
     machine = plant or build_plant()
     tables = calibration or load_calibration()
     same_stages(geometry=machine.vanes, vane_angles=tables.vanes)
@@ -168,8 +202,9 @@ def build_chain(
         smooth = without_noise(t, have, machine, rough.slipping(rough.signals(), machine.p))
     if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
         if "x_dem" in columns and not theirs:
-            law, *off = servo_law(t, have, cal, smooth, draws)
-            what = other_current(t, have, law, run, cal)
+            samples = min(10, max(1, round(dt / grid.steps["i_cmd"])))
+            law, *off = servo_law(t, have, cal, smooth, draws, samples)
+            what = other_current(t, have, law, run, cal, samples)
             if what:
                 notes.append(
                     f"i_cmd: {what}, not the mean of those since the row before, which is worked out from stroke and "
@@ -177,7 +212,7 @@ def build_chain(
                 )
                 columns["i_cmd"] = have["i_cmd"]
                 smooth = without_noise(t, have, machine, rough.slipping(rough.signals(), machine.p))
-                law, *off = servo_law(t, have, cal, smooth, draws)
+                law, *off = servo_law(t, have, cal, smooth, draws, samples)
             sampled = what == SAMPLED
             have["law"], have["law_error"] = law, off[1] if sampled else off[0]
             unknown = off[0][:, 0] - off[1][:, 0] if sampled else None
@@ -186,6 +221,14 @@ def build_chain(
                 between_rows(have, law, size, run, cal, unknown, seed) for seed in (0, 1)
             )
         have["stroke"] = smooth.stroke
+    coarse_current = None
+    if dt > 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
+        what = _slow_current(Driven(t, have, machine, cal, ("x_lvdt",), currents, present))
+        if what:
+            notes.append(f"i_cmd: {what}, not the mean since the row before, which is worked out from it")
+            coarse_current = SLOW_CURRENTS[what](columns["i_cmd"][::2])
+            columns["i_cmd"] = have["i_cmd"] = SLOW_CURRENTS[what](columns["i_cmd"])
+            smooth = without_noise(t, have, machine, rough.slipping(rough.signals(), machine.p))
     turns: Callable[[], dict[str, Array]] = dict
     if "x_lvdt" in columns:
         stroke = have.get("stroke", columns["x_lvdt"])
@@ -232,7 +275,7 @@ def build_chain(
         if dt > 1.5 * RASTER:
             # a corner of an input between two rows costs about as much as the corners that the doubled raster loses
             # besides
-            coarse = make(driven.at(slice(None, None, 2), every_other(have), rows[::2]))
+            coarse = make(driven.at(slice(None, None, 2), every_other(have, coarse_current), rows[::2]))
             more = rms(coarse, stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0])
             stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
         _at_own_rate(stage, outputs, log, grid)
@@ -260,6 +303,21 @@ def build_chain(
         stage.floor = noise_of(stage, stage.neutral())
         stages.append(stage)
     return Chain(t, stages, absent, columns, machine, tables, cal, notes, steps, start=grid.start)
+
+
+def _slow_current(driven: Driven) -> str:
+    """Which of `SLOW_CURRENTS` moves the piston as logged clearly better than the mean since the row before; "":
+    none.
+    """
+
+    def misfit(current: Array) -> float:
+        stage = actuator_stage(driven._replace(columns={**driven.columns, "i_cmd": current}))
+        return float(rms(stage, stage.measured - stage.run(stage.neutral()[None])[0])[0])
+
+    i = driven.columns["i_cmd"]
+    misfits = {what: misfit(mean_of(i)) for what, mean_of in SLOW_CURRENTS.items()}
+    what = min(misfits, key=lambda k: misfits[k])
+    return what if misfits[what] < 0.9 * misfit(i) else ""
 
 
 def _never_changes(values: Array) -> bool:

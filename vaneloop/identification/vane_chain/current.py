@@ -4,6 +4,7 @@ shows.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -31,14 +32,17 @@ from vaneloop.identification.settings import (
 )
 from vaneloop.identification.subsystem import Array
 
-__all__ = ["BEFORE", "SAMPLED", "Smooth", "between_rows", "other_current", "servo_law", "without_noise"]
+__all__ = [
+    "BEFORE", "SAMPLED", "SLOW_CURRENTS", "Smooth", "between_rows", "law_of", "other_current", "samples_of",
+    "servo_law", "without_noise",
+]  # fmt: skip
 
-SAMPLED = "the current of the tick at each row"
+SAMPLED = "the current at single ticks"
 BEFORE = "the mean of the ten ticks before the row"
 
 
 def servo_law(
-    t: Array, c: dict[str, Array], cal: Calibration, smooth: Smooth, draws: int = CURRENT_DRAWS
+    t: Array, c: dict[str, Array], cal: Calibration, smooth: Smooth, draws: int = CURRENT_DRAWS, samples: int = 1
 ) -> tuple[Array, Array, Array]:
     """What the firmware's servo loop makes of logged demand and stroke, but for a constant of its integral.
 
@@ -46,8 +50,8 @@ def servo_law(
     the stroke.
 
     Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; and draws of
-    how much their mean, and the last of them, are off because not all of stroke and demand is logged, each
-    float64[rows, draws].
+    how much their mean, and that of the ticks that `samples_of` gives for ``samples``, are off because not all of
+    stroke and demand is logged, each float64[rows, draws].
     """
     x_dem, x = c["x_dem"], c["x_lvdt"]
     gains = (cal.scalars.kp, cal.scalars.ki, cal.scalars.kff)  # A/m = mA/mm
@@ -62,7 +66,7 @@ def servo_law(
     # not known: the LVDT's noise in nine ticks, what smoothing leaves at the rows, the way between them, which is known
     # as well as a straight line and a cubic agree, and what the logged demand's last digit hides
     draw, step = np.random.default_rng(0), resolution(x_dem)
-    of_mean, of_last = np.empty((len(t), draws)), np.empty((len(t), draws))
+    of_mean, of_some = np.empty((len(t), draws)), np.empty((len(t), draws))
     off, ticks = stroke, np.empty(when.shape)
     for k in range(draws):
         left = smooth.left(draw) + smooth.distortion
@@ -73,8 +77,20 @@ def servo_law(
         np.subtract(ticks, off, out=off)
         off[:, -1] = 0.0
         _loop(-step * draw.uniform(-0.5, 0.5, len(t)), off, *gains, ticks)
-        of_mean[:, k], of_last[:, k] = ticks.mean(axis=1), ticks[:, -1]
-    return law, of_mean, of_last
+        of_mean[:, k], of_some[:, k] = ticks.mean(axis=1), samples_of(ticks, samples)
+    return law, of_mean, of_some
+
+
+def law_of(x_dem: Array, stroke: Array, cal: Calibration, logged: Array | None = None) -> Array:
+    """The servo loop's current (mA) at the ten ticks up to each row for a demand and a stroke (mm) at the rows, but for
+    a constant of its integral: linear in both. ``logged``: the stroke at the rows with its noise, which it had there.
+    """
+    ticks, out = np.empty((len(stroke), 10)), np.empty((len(stroke), 10))
+    _between(stroke, SplineRates(np.arange(float(len(stroke))))(stroke), ticks)
+    if logged is not None:
+        ticks[:, -1] = logged
+    _loop(x_dem, ticks, cal.scalars.kp, cal.scalars.ki, cal.scalars.kff, out)
+    return out
 
 
 @compiled
@@ -140,12 +156,21 @@ def between_rows(
     return np.asarray(ticks)
 
 
-def other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Calibration) -> str:
+def samples_of(ticks: Array, samples: int) -> Array:
+    """What a logger makes of the ten ticks of a row that takes so many evenly spaced ``samples`` of them, the last at
+    the row: their mean.
+    """
+    return np.asarray(ticks[:, np.ceil(10.0 / samples * np.arange(1, samples + 1)).astype(int) - 1].mean(axis=1))
+
+
+def other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Calibration, samples: int = 1) -> str:
     """Where the log's current is not the mean of the ticks since the row before, the one at the row included, put that
     in its place.
 
     The firmware's ``law`` on the logged stroke says which it is instead (`SAMPLED`, `BEFORE`; "": neither), and what
     the other ticks added.
+
+    samples  of the current that the log has between two rows, whose mean stands there
     """
     width = int(round(WINDOW / RASTER))
     use = run & (np.abs(c["i_cmd"]) < 0.9e3 * cal.scalars.current_limit)
@@ -156,12 +181,27 @@ def other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Ca
         return float(np.median(np.std(e, axis=1))) if len(e) else 0.0
 
     mean = law.mean(axis=1)
-    others = {SAMPLED: law[:, -1], BEFORE: mean + 0.1 * (np.roll(law[:, -1], 1) - law[:, -1])}
+    others = {SAMPLED: samples_of(law, samples), BEFORE: mean + 0.1 * (np.roll(law[:, -1], 1) - law[:, -1])}
     what = min(others, key=lambda k: misfit(others[k]))
     if misfit(others[what]) >= 0.9 * misfit(mean):
         return ""
     c["i_cmd"] = c["i_cmd"] + (mean - others[what])
     return what
+
+
+def _line_between(i: Array) -> Array:
+    return np.concatenate([i[:1], 0.5 * (i[:-1] + i[1:])])
+
+
+def _held(i: Array) -> Array:
+    return np.concatenate([i[:1], i[:-1]])
+
+
+# What a current may be that was logged more slowly than the controller's frames, and the mean since the row before that
+# follows from it.
+SLOW_CURRENTS: Mapping[str, Callable[[Array], Array]] = {
+    "the current at single ticks": _line_between, "the current from each row on": _held,
+}  # fmt: skip
 
 
 # ---- The logged stroke with less of the LVDT's noise in it

@@ -108,6 +108,7 @@ def _columns(channels: Mapping[str, Channel], grid: Grid, t: Array) -> tuple[dic
     dt, first = grid.dt, grid.start
     reference = answers(channels) or max((c for c in channels.values()), key=lambda c: len(c.t))
     own = float(np.median(np.diff(reference.t)))
+    own = dt if abs(own - dt) < 0.02 * dt else own  # a jitter's median would add up over the log
     phase = float(np.median((reference.t - first + 0.5 * own) % own) - 0.5 * own) if own >= 0.5 * dt else 0.0
     when = t + first + phase
     had = taken(channels, when, 0.5 * dt)
@@ -132,8 +133,8 @@ def _columns(channels: Mapping[str, Channel], grid: Grid, t: Array) -> tuple[dic
             count = np.maximum(np.diff(edge), 1)
             columns[name] = np.diff(total[edge]) / count
         elif (
-            uniform.mean() > 0.98 and abs(step - dt) < 0.02 * dt or name in ("n_dem", "x_dem", "state")
-            or _held(c, step, dt)
+            uniform.mean() > 0.98 and abs(step - dt) < 0.02 * dt and not _between_rows(c, when, dt)
+            or name in ("n_dem", "x_dem", "state") or _held(c, step, dt)
         ):  # fmt: skip
             # rows of a regular logger: the nearest row, whatever its clock's jitter; commands and what comes in frames
             # hold their value
@@ -146,6 +147,14 @@ def _columns(channels: Mapping[str, Channel], grid: Grid, t: Array) -> tuple[dic
         fresh &= away < 1.5 * max(step, dt)  # one or two rows are bridged, more are a gap
         missing |= away > 0.75 * max(step, dt)
     return {name: no_smaller(v) for name, v in columns.items()}, fresh, missing
+
+
+def _between_rows(c: Channel, when: Array, dt: float) -> bool:
+    """Whether the channel's samples stand between the rows, as those of another clock do, and not only jitter."""
+    i = np.clip(np.searchsorted(c.t, when - 0.5 * dt), 0, len(c.t) - 1)
+    apart = (c.t[i] - when)[np.abs(c.t[i] - when) <= 0.5 * dt]
+    turn = np.exp(2j * np.pi * apart / dt).mean() if len(apart) else 1.0
+    return bool(abs(np.angle(turn)) / (2.0 * np.pi) > 0.1 or abs(turn) < 0.5)
 
 
 def _held(c: Channel, step: float, dt: float) -> bool:
@@ -166,10 +175,12 @@ def _to_frame(channels: Mapping[str, Channel], steps: Mapping[str, float], start
     return 0.0
 
 
-def every_other(columns: dict[str, Array]) -> dict[str, Array]:
-    """Every other row; of the current, which is a mean since the row before, the mean of two."""
+def every_other(columns: dict[str, Array], current: Array | None = None) -> dict[str, Array]:
+    """Every other row; of the current, which is a mean since the row before, the mean of two, or ``current``."""
     out = {k: v[::2] for k, v in columns.items()}
-    if "i_cmd" in columns:
+    if current is not None:
+        out["i_cmd"] = current
+    elif "i_cmd" in columns:
         i = columns["i_cmd"]
         out["i_cmd"] = np.concatenate([i[:1], 0.5 * (i[1:-1:2] + i[2::2])])
     return out

@@ -1,0 +1,40 @@
+"""Rows that a logger wrote again because nothing new had come: every channel repeats the row before, to the last bit.
+
+A channel with noise in its last digit repeats itself by chance now and then, and seldom often on end. The channel that
+does so least tells how many repeated rows on end are beyond chance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+__all__ = ["stale_rows"]
+
+CHANCE = 1e-6  # that any row of the log is taken for stale where all were sampled
+FEWEST = 2  # repeated rows on end; a single one may be a clock that ticked twice
+MOST = 0.5  # share of rows; where more repeat, the channels are slower than the rows
+
+
+def stale_rows(columns: Sequence[np.ndarray]) -> np.ndarray:
+    """Which rows of the ``columns`` of one table, each float64[rows], are stale: bool[rows]."""
+    rows = len(columns[0]) if columns else 0
+    out = np.zeros(rows, dtype=bool)
+    if rows < 10:
+        return out
+    repeats = np.array([v[1:] == v[:-1] for v in columns])
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], repeats.all(axis=0).astype(np.int8), [0]])))
+    first, length = edges[::2] + 1, edges[1::2] - edges[::2]
+    long = length >= FEWEST
+    if not long.any():
+        return out
+    first, length = first[long], length[long]
+    for begin, many in zip(first, length, strict=True):
+        out[begin : begin + many] = True
+    others = repeats[:, ~out[1:]]
+    chance = float((others.sum(axis=1).min() + 1) / (others.shape[1] + 1))
+    for begin, many in zip(first, length, strict=True):
+        if chance**many * rows > CHANCE:
+            out[begin : begin + many] = False
+    return out if out.mean() <= MOST else np.zeros(rows, dtype=bool)

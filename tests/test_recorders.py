@@ -1,0 +1,93 @@
+"""What a recorder does to a log is no physics: rows that repeat, what a sample of the current is, clocks that
+differ.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks.loggers import Logger, recorded
+from hil.logs import Channel, Log
+from hil.logs.stale import stale_rows
+from tests import rig
+from tests.firmware_on_rig import firmware
+from tests.test_loggers import rows
+from vaneloop.identification.vane_chain.chain import Chain, build_chain
+from vaneloop.identification.vane_chain.current import SLOW_CURRENTS, samples_of
+from vaneloop.identification.workflow import compare_stages, diagnose
+
+SEED, DURATION = 41, 120.0
+GROUPS = {"bus": ("n_dem", "x_dem", "state"), "vanes": ("vigv", "vgv1", "vgv2")}
+
+
+def verdicts(chain: Chain) -> dict[str, str]:
+    return {s.stage: s.verdict for s in diagnose(chain.stages, workers=1).stages}
+
+
+@given(st.integers(0, 2**31), st.integers(5, 39), st.sampled_from([0.0, 0.001, 1.0]))
+def test_rows_that_only_repeat_are_found_and_no_others(seed: int, length: int, digit: float):
+    """Noise of 1 in each of three channels; with a last digit of 1 single rows repeat by chance."""
+    rng = np.random.default_rng(seed)
+    columns = rng.standard_normal((3, 2000)) * (3.0 if digit == 1.0 else 1.0)
+    columns = np.round(columns / digit) * digit if digit else columns
+    assert not stale_rows(list(columns)).any()
+    if digit == 1.0:
+        return  # five on end may be chance
+    first = int(rng.integers(1, 1900))
+    columns[:, first : first + length] = columns[:, first - 1 : first]
+    assert np.array_equal(np.flatnonzero(stale_rows(list(columns))), first + np.arange(length))
+
+
+def test_a_channel_that_is_slower_than_the_rows_is_not_stale():
+    held = np.repeat(np.random.default_rng(0).standard_normal(200), 10)
+    assert not stale_rows([held, 2.0 * held]).any()
+    assert not stale_rows([np.zeros(500), np.ones(500)]).any()
+
+
+def test_what_a_sample_of_the_current_is():
+    ticks = np.arange(30.0).reshape(3, 10)
+    assert np.array_equal(samples_of(ticks, 10), ticks.mean(axis=1))
+    assert np.array_equal(samples_of(ticks, 1), ticks[:, 9])
+    assert np.array_equal(samples_of(ticks, 2), ticks[:, [4, 9]].mean(axis=1))
+    ramp = np.arange(5.0)  # at each row; the mean since the row before is half a row earlier
+    line, held = (mean_of(ramp) for mean_of in SLOW_CURRENTS.values())
+    assert np.array_equal(line[1:], ramp[1:] - 0.5)
+    assert np.array_equal(held[1:], ramp[:-1])
+
+
+def test_clocks_of_several_recorders_are_set_right():
+    log, late = rows(SEED), {"bus": 0.02, "vanes": 0.013}
+    of = {name: g for g, names in GROUPS.items() for name in names}
+    channels = {k: Channel(log["t"] + late.get(of.get(k, ""), 0.0), v) for k, v in log.items() if k != "t"}
+    chain = build_chain(Log("clocks", channels, []))
+    said = " ".join(chain.notes)
+    assert "x_dem: stand 20 ms late" in said
+    assert "n_dem: stand 20 ms late" in said
+    assert "vigv, vgv1, vgv2: stand 1" in said
+    assert "x_lvdt" not in said
+    figures = [s for s in compare_stages(chain.stages) if s.stage != "actuator"]
+    assert all(s.agrees for s in figures), [(s.signal, s.ratio) for s in figures]
+
+
+def test_one_clock_stays_as_it_is():
+    assert not [n for n in build_chain(Log("clean", {k: Channel(rows(SEED)["t"], v) for k, v in rows(SEED).items()
+                                                     if k != "t"}, [])).notes if "stand" in n]  # fmt: skip
+
+
+@functools.cache
+def fine() -> dict[str, np.ndarray]:
+    """A log of the rig with a row each ms."""
+    return rig.simulate(rig.manoeuvre(SEED, DURATION), firmware(), seed=SEED, rate=1000).log
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [10, 20, 25, 50, 100, 200, 500])
+def test_a_current_at_single_ticks_is_no_missing_physics(rate: int):
+    log = recorded(fine(), Logger(rate), np.random.default_rng(1))
+    said = verdicts(build_chain(Log("ticks", log, [])))
+    assert set(said.values()) == {"none"}, said

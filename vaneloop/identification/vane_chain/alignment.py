@@ -1,0 +1,254 @@
+"""The clocks of a log: by how much the samples of some channels stand late in the file.
+
+Who records the bus, the controller and the vanes with three devices has three clocks and three filters. What that does
+to a log is no physics, and it is worked out before the search looks for any. Only what the machine cannot do counts as
+the recorder's:
+
+| subsystem | what stands late | why no machine does that |
+|---|---|---|
+| servo | stroke demand or stroke against the current | the firmware's law leaves no time |
+| demand | rotor speed against the stroke demand | an answer before its cause |
+| engine | rotor speed and all else against its demand | lags bend a response, they do not move it |
+| linkage | all vane angles alike against the stroke; also more and more | each sensor has a lag of its own |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hil.logs import Log
+from plant import chain
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
+from vaneloop.identification.settings import AGREES, EXPLAINED, LATE, RASTER, WINDOW
+from vaneloop.identification.subsystem import Array, Stage
+from vaneloop.identification.vane_chain.current import law_of
+from vaneloop.identification.vane_chain.subsystem_data import Made
+
+__all__ = ["Late", "aligned", "late_in_controller", "late_vanes"]
+
+Both = tuple[Array, Array]  # the mean of a row's ticks, and the last of them
+LEAST_LATE = chain.TICK  # s; the controller does nothing between two ticks
+MOVES_ALIKE = 0.1  # share of what moving channels explains, by which fewer of them may explain less
+FEWEST_WINDOWS = 10  # that tell
+STEPS = 4  # of Gauss and Newton; each leaves a hundredth of an offset that is short against the motion
+SLOPE = 5e-4  # s, by which channels are moved to see what that changes
+
+
+class Late(NamedTuple):
+    """Channels whose samples stand ``seconds`` late in the file at the middle of the log, and ``drift`` (s/s) more with
+    each second; times count from the start of the log's stages.
+    """
+
+    channels: tuple[str, ...]
+    seconds: float
+    drift: float = 0.0
+    middle: float = 0.0
+
+    def text(self) -> str:
+        """What is said of it."""
+        way = "late" if self.seconds >= 0.0 else "early"
+        more = f", and {1e6 * self.drift:.3g} us more each second" if self.drift else ""
+        return f"{', '.join(self.channels)}: stand {abs(1e3 * self.seconds):.3g} ms {way} in the file{more}; moved"
+
+    def times(self, t: Array) -> Array:
+        """The true times of samples that the file has at ``t`` (s)."""
+        return np.asarray(t - self.seconds - self.drift * (t - self.middle))
+
+
+def aligned(log: Log, late: Sequence[Late], start: float) -> Log:
+    """The log with its channels where they belong; ``start``: s of its own time, where that of its stages is 0."""
+    channels = dict(log.channels)
+    for one in late:
+        for name in one.channels:
+            if name in channels:
+                c = channels[name]
+                channels[name] = replace(c, t=start + one.times(c.t - start))
+    return replace(log, channels=channels)
+
+
+def late_in_controller(stages: Sequence[Stage]) -> list[Late]:
+    """Channels of the controller and of the ECU that stand late, as the stages of a log say where they fail."""
+    of = _judged(stages)
+    out = _servo(of["servo"]) if "servo" in of else []
+    moved = {name: one.seconds for one in out for name in one.channels}
+    if "demand" in of:
+        out += _one(of["demand"], ("n_r",), lambda d: d > 0.0, moved)
+        moved |= {name: one.seconds for one in out for name in one.channels}
+    return out + (_one(of["engine"], ("n_dem",), lambda d: True, moved) if "engine" in of else [])
+
+
+def late_vanes(stages: Sequence[Stage]) -> list[Late]:
+    """Whether all vane angles stand late alike, and more and more where their clock is a fast one. They stand early
+    only where the actuator fits: a slow LVDT looks alike, but there, too.
+    """
+    of = _judged(stages)
+    stage = of.get("linkage")
+    if stage is None or len(stage.outputs) < 2 or _fits(stage):
+        return []
+    t, c = stage.t, stage.made.driven.columns  # type: ignore[attr-defined]
+    length = max(float(np.ptp(t)), 1.0)
+    middle = 0.5 * float(t[0] + t[-1])
+
+    def shifted(late: Array) -> dict[str, Array]:
+        d = -(late[0] + late[1] * (t - middle) / length)
+        return {name: _shifted(t, c[name], d) for name in ("x_lvdt", "stroke", "n_r") if name in c}
+
+    late, before, after = _fit(stage, _moving(stage, shifted), 2)
+    if not _explains(before, after) or np.any(np.abs(late) >= LATE):
+        return []
+    if late[0] < 0.0 and "actuator" in of and not _fits(of["actuator"]):
+        return []
+    return [Late(stage.outputs, float(late[0]), float(late[1]) / length, middle)]
+
+
+def _judged(stages: Sequence[Stage]) -> dict[str, Stage]:
+    return {s.name: s for s in stages if s.floor is not None and isinstance(s.made, Made)}
+
+
+def _shifted(t: Array, values: Array, late: float | Array) -> Array:
+    return np.asarray(np.interp(t + late, t, values))
+
+
+def _servo(stage: Stage) -> list[Late]:
+    """Stroke demand and stroke against the current, by the firmware's law, which is linear in both.
+
+    The current is the mean of the ticks since the row before or that of the last; the noise that it shares with the
+    stroke at the row tells which, where the stroke need not move.
+    """
+    if _fits(stage):
+        return []
+    driven = stage.made.driven  # type: ignore[attr-defined]
+    t, c, cal = driven.t, driven.columns, driven.calibration
+    width = int(round(WINDOW / RASTER))
+    rows = len(t) // width * width
+    whole = np.isfinite(stage.measured[0, :rows]).reshape(-1, width).all(axis=1)
+    if whole.sum() < FEWEST_WINDOWS:
+        return []
+
+    def centred(values: Array) -> Array:
+        v = values[:rows].reshape(-1, width)[whole]
+        return np.asarray((v - v.mean(axis=1, keepdims=True)).ravel())
+
+    def both(ticks: Array) -> tuple[Array, Array]:
+        return centred(ticks.mean(axis=1)), centred(ticks[:, -1])
+
+    none, current = np.zeros(len(t)), centred(c["i_cmd"])
+
+    def demands(late: Array) -> list[tuple[Array, Array]]:
+        return [both(law_of(_shifted(t, c["x_dem"], d), none, cal)) for d in late]
+
+    def strokes(late: Array) -> list[tuple[Array, Array]]:
+        logged = {0.0: c["x_lvdt"]}
+        return [both(law_of(none, _shifted(t, c["stroke"], d), cal, logged.get(float(d)))) for d in late]
+
+    def least(kind: int, late: Array, other: Array, d: Sequence[Both], x: Sequence[Both]) -> tuple[float, float, float]:
+        left = current[None] - np.array([one[kind] for one in d])
+        own = np.array([one[kind] for one in x])
+        power = np.sum(left**2, axis=1)[:, None] - 2.0 * left @ own.T + np.sum(own**2, axis=1)[None]
+        j, k = np.unravel_index(int(np.argmin(power)), power.shape)
+        return float(power[j, k]), float(late[j]), float(other[k])
+
+    grid, fine, here = np.arange(-10, 11) * 4e-3, np.arange(-8, 9) * 5e-4, np.zeros(1)
+    as_logged, found = (demands(here), strokes(here)), []
+    as_is = min(least(kind, here, here, *as_logged)[0] for kind in (0, 1))
+    d, x = demands(grid), strokes(grid)
+    for kind in (0, 1):
+        _, late, _ = least(kind, grid, here, d, as_logged[1])
+        found.append(least(kind, late + fine, here, demands(late + fine), as_logged[1]))
+        _, late, other = least(kind, grid, grid, d, x)
+        found.append(least(kind, late + fine, other + fine, demands(late + fine), strokes(other + fine)))
+    best = min(found)
+    noise = float(stage.floor[0]) ** 2 * len(current)  # type: ignore[index]
+    if as_is - best[0] < EXPLAINED * max(as_is - noise, 0.0):
+        return []
+    # the fewer channels have to move, the better
+    near = [f for f in found if f[0] - best[0] <= MOVES_ALIKE * (as_is - best[0])]
+    _, late_demand, late_stroke = min(near, key=lambda f: (f[2] != 0.0, f[0]))
+    return [Late((n,), late) for n, late in (("x_dem", late_demand), ("x_lvdt", late_stroke)) if abs(late) > LEAST_LATE]
+
+
+def _fit(stage: Stage, moved: Callable[[Array], Stage], terms: int, frame: float = 0.0) -> tuple[Array, Array, Array]:
+    """Offsets (s, float64[terms]) that suit a stage best with its nominal parameters, and its outputs' mean squared
+    errors without and with them, in noise floors.
+    """
+    floor = np.asarray(stage.floor)
+    judge = LeastSquaresProblem(stage, floor)
+    theta, late = recalibrate(judge).theta, np.zeros(terms)
+    free = [i for i, p in enumerate(stage.parameters) if p.tolerance > 0.0]
+    sizes = np.array([0.05 * stage.parameters[i].tolerance for i in free])
+    n = np.maximum(judge.valid.sum(axis=1), 1)
+    before = np.sum(judge.errors(theta[None])[0] ** 2, axis=1) / n
+    for _ in range(STEPS):
+        at = LeastSquaresProblem(moved(late), floor)
+        tries = np.repeat(theta[None], len(free) + 1, axis=0)
+        tries[np.arange(1, len(free) + 1), free] += sizes
+        e = at.errors(tries)
+        columns = [(e[k + 1] - e[0]).ravel() / sizes[k] for k in range(len(free))]
+        for k in range(terms):
+            other = late.copy()
+            other[k] += SLOPE
+            beside = LeastSquaresProblem(moved(other), floor).errors(theta[None])[0]
+            columns.append((beside - e[0]).ravel() / SLOPE)
+        scale = np.array([*(stage.parameters[i].tolerance for i in free), *[LATE] * terms])
+        a = np.array(columns).T * scale
+        prior = np.diag([*[3.0**0.5] * len(free), *[0.0] * terms])
+        held = np.array([*((theta[i] - stage.parameters[i].expected) / stage.parameters[i].tolerance for i in free),
+                         *[0.0] * terms])  # fmt: skip
+        step = np.linalg.lstsq(np.vstack([a, prior]), -np.concatenate([e[0].ravel(), prior @ held]), rcond=None)[0]
+        step *= scale
+        theta = theta.copy()
+        theta[free] += step[: len(free)]
+        late = np.clip(late + step[len(free) :], -LATE, LATE)
+    offsets = [late]
+    if frame:  # what comes in frames stands late by whole ones
+        offsets.append(np.round(late / frame) * frame)
+    errors = [np.sum(LeastSquaresProblem(moved(x), floor).errors(theta[None])[0] ** 2, axis=1) / n for x in offsets]
+    k = min(range(len(offsets)), key=lambda k: float(errors[k].sum()))
+    return offsets[k], before, errors[k]
+
+
+def _explains(before: Array, after: Array) -> bool:
+    """Whether every output that fails gets better, and together by at least half of what they are above the noise."""
+    excess, left = np.maximum(before - 1.0, 0.0), np.maximum(after - 1.0, 0.0)
+    return bool(np.all(after <= before * 1.0001) and left.sum() <= (1.0 - EXPLAINED) * excess.sum())
+
+
+def _moving(stage: Stage, of: Callable[[Array], Mapping[str, Array]]) -> Callable[[Array], Stage]:
+    """A function from offsets to the stage with other columns."""
+    made = stage.made
+    assert isinstance(made, Made)
+
+    def moved(late: Array) -> Stage:
+        return made.make(made.driven._replace(columns={**made.driven.columns, **of(late)}, again=True))
+
+    return moved
+
+
+def _one(
+    stage: Stage, channels: tuple[str, ...], allowed: Callable[[float], bool], already: Mapping[str, float]
+) -> list[Late]:
+    """One offset of ``channels`` that drive a stage against all else in it."""
+    t, c = stage.t, stage.made.driven.columns  # type: ignore[attr-defined]
+    if _fits(stage):
+        return []
+    outputs = {already.get(o, 0.0) for o in stage.outputs}
+    base = outputs.pop()  # what it explains has been moved by this
+
+    def of(late: Array) -> dict[str, Array]:
+        out = {name: _shifted(t, c[name], float(late[0])) for name in channels if name in c}
+        return out
+
+    late, before, after = _fit(stage, _moving(stage, of), 1, RASTER)
+    if not _explains(before, after) or not allowed(float(late[0])) or abs(late[0]) >= LATE:
+        return []
+    return [Late(channels, float(late[0]) + base)]
+
+
+def _fits(stage: Stage) -> bool:
+    judge = LeastSquaresProblem(stage, np.asarray(stage.floor))
+    e = judge.errors(recalibrate(judge).theta[None])[0]
+    return bool(np.all(np.sum(e**2, axis=1) <= AGREES**2 * judge.valid.sum(axis=1)))
