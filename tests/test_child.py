@@ -13,6 +13,7 @@ import pytest
 from hil.logs import Channel, read_log, write_log
 from hil.logs.recorder import RecorderProcess
 from tests.conftest import ROOT
+from tests.syntax import nodes
 from tests.test_structure import PACKAGES, python_files
 from vaneloop.base.child import python, python_module
 
@@ -53,7 +54,7 @@ def test_every_process_of_ours_is_started_so() -> None:
         str(path.relative_to(ROOT))
         for package in PACKAGES
         for path in python_files(package)
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Attribute) and ast.unparse(node) == "sys.executable"
+        for node in nodes(path.read_text(encoding="utf-8"))
+        if isinstance(node, ast.Attribute) and node.attr == "executable" and ast.unparse(node.value) == "sys"
     }
     assert found == set(own)

@@ -14,6 +14,7 @@ import pytest
 
 from benchmarks import start
 from tests.conftest import ROOT
+from tests.syntax import nodes
 from tests.test_structure import PACKAGES
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
@@ -120,7 +121,7 @@ MODULES = {
 def test_what_a_number_must_be_is_said_with_the_number() -> None:
     without = []
     for file in (*(ROOT / "vaneloop" / "cli").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for node in nodes(file.read_text(encoding="utf-8")):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "InputError" and node.args:
                 said = node.args[0]
                 if isinstance(said, ast.Constant) and "must be" in str(said.value):

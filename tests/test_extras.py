@@ -15,6 +15,7 @@ import pytest
 from hil.logs import Channel, write_log
 from plant import load_geometry
 from tests.conftest import ROOT
+from tests.syntax import nodes
 from tests.test_structure import PACKAGES
 from vaneloop.base import extras
 from vaneloop.base.errors import InputError
@@ -120,7 +121,7 @@ def test_the_product_imports_only_what_is_installed_or_asked_for() -> None:
         known |= names(PROJECT["optional-dependencies"][extra])
     unknown = set()
     for file in (f for package in PACKAGES for f in (ROOT / package).rglob("*.py") if "templates" not in f.parts):
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        for node in nodes(file.read_text(encoding="utf-8")):
             if isinstance(node, ast.Import):
                 found = [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:

@@ -19,6 +19,7 @@ import scipy
 
 from tests.conftest import ROOT
 from tests.pythons import PYTHONS
+from tests.syntax import nodes
 from vaneloop.cli.main import IN_CHECKOUT
 
 PACKAGES = ("controller", "plant", "hil", "vaneloop")
@@ -228,6 +229,15 @@ EXPORTS: dict[str, list[str]] = {
 }
 
 
+IMPORTERS = ("import_module", "__import__")
+
+
+def called(call: ast.Call) -> str:
+    """Last word of what is called: import_module of importlib.import_module(x)."""
+    f = call.func
+    return f.attr if isinstance(f, ast.Attribute) else f.id if isinstance(f, ast.Name) else ""
+
+
 def imported_names(source: str, file: str) -> Iterator[tuple[int, str]]:
     """Every dotted name that ``source`` imports, with its line, wherever in the file the import stands.
 
@@ -235,7 +245,7 @@ def imported_names(source: str, file: str) -> Iterator[tuple[int, str]]:
     import_module("a") and __import__("a") with a constant name count too.
     """
     package = Path(file).parent.parts
-    for node in ast.walk(ast.parse(source, file)):
+    for node in nodes(source):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield node.lineno, alias.name
@@ -250,16 +260,8 @@ def imported_names(source: str, file: str) -> Iterator[tuple[int, str]]:
             and node.args
             and isinstance(node.args[0], ast.Constant)
             and isinstance(node.args[0].value, str)
-        ):
-            called = (
-                node.func.attr
-                if isinstance(node.func, ast.Attribute)
-                else node.func.id
-                if isinstance(node.func, ast.Name)
-                else ""
-            )
-            if called in ("import_module", "__import__"):
-                yield node.lineno, node.args[0].value
+        ) and called(node) in IMPORTERS:
+            yield node.lineno, node.args[0].value
 
 
 def within(name: str, room: str) -> bool:
@@ -383,7 +385,7 @@ CHECKOUT = ("tests", "benchmarks")  # folders of Python that are not installed
 
 def names_of_the_checkout(source: str) -> list[str]:
     """Modules of the checkout that ``source`` imports, or has as a text, which importlib may be given."""
-    texts = [n.value for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
+    texts = [n.value for n in nodes(source) if isinstance(n, ast.Constant) and isinstance(n.value, str)]
     spelled = [text for text in texts if re.fullmatch(r"\w+(\.\w+)+", text)]
     imported = [name for _, name in imported_names(source, "x.py")]
     return [name for name in (*imported, *spelled) if name.split(".")[0] in CHECKOUT]
@@ -417,7 +419,7 @@ def product_files() -> dict[str, str]:
 def late_imports(source: str) -> dict[str, int]:
     """Modules that functions import, also by import_module with a constant name, with the line of the last import."""
     found: dict[str, int] = {}
-    for function in ast.walk(ast.parse(source)):
+    for function in nodes(source):
         if not isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
             continue
         for node in ast.walk(function):
@@ -425,11 +427,7 @@ def late_imports(source: str) -> dict[str, int]:
                 found |= {alias.name: node.lineno for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
                 found["." * node.level + (node.module or "")] = node.lineno
-            elif (
-                isinstance(node, ast.Call)
-                and ast.unparse(node.func).rpartition(".")[2] in ("import_module", "__import__")
-                and isinstance(node.args[0], ast.Constant)
-            ):
+            elif isinstance(node, ast.Call) and called(node) in IMPORTERS and isinstance(node.args[0], ast.Constant):
                 found[str(node.args[0].value)] = node.lineno
     return found
 
@@ -478,7 +476,7 @@ def circles(sources: dict[str, str]) -> list[set[str]]:
     number = {file: i for i, file in enumerate(sources)}
     graph = np.zeros((len(sources), len(sources)), dtype=bool)
     for file, source in sources.items():
-        for node in ast.walk(ast.parse(source)):
+        for node in nodes(source):
             if isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 wanted = [f"{node.module}.{a.name}" if f"{node.module}.{a.name}" in names else node.module
                           for a in node.names]  # fmt: skip
@@ -553,7 +551,7 @@ def records_of_own_arrays(source: str) -> list[str]:
     views = {"as_inputs", "as_outputs", "as_scalars", "as_state"}
     makers = {"empty", "zeros", "ones", "full", "copy", "empty_like", "zeros_like"}
     found = []
-    for function in ast.walk(ast.parse(source)):
+    for function in nodes(source):
         if not isinstance(function, ast.FunctionDef):
             continue
         if not any("compiled" in ast.unparse(d) or "njit" in ast.unparse(d) for d in function.decorator_list):
@@ -664,7 +662,7 @@ def test_what_holds_arrays_is_compared_by_identity() -> None:
     fields: dict[str, list[str]] = {}
     identity: dict[str, bool] = {}
     for path in sorted((ROOT / "vaneloop" / "identification").rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in nodes(path.read_text(encoding="utf-8")):
             how = [ast.unparse(d) for d in getattr(node, "decorator_list", ()) if "dataclass" in ast.unparse(d)]
             if isinstance(node, ast.ClassDef) and how:
                 held = [ast.unparse(a.annotation) for a in node.body if isinstance(a, ast.AnnAssign)]

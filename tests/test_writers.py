@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from tests.conftest import ROOT
+from tests.syntax import nodes
 from tests.test_structure import PACKAGES, python_files
 
 # Functions and methods that make, fill, cut or replace a file, of whatever library.
@@ -142,7 +143,7 @@ def writers(source: str) -> Iterator[tuple[int, str, bool]]:
             else:
                 yield from walk(child, given)
 
-    yield from walk(ast.parse(source), frozenset())
+    yield from walk(nodes(source)[0], frozenset())
 
 
 def test_every_writer_goes_through_the_one_function_or_says_why_not() -> None:
