@@ -143,7 +143,10 @@ SMALLER = {"--frames 10000000": "--frames 20000", "--logs 40": "--logs 1 --durat
            "--out out/motor.parquet": "--out out/motor.parquet --logs 1 --duration 60"}  # fmt: skip
 # commands whose examples take long
 LONG = {"strategies", "design", "spatial", "clearance", "experiment", "diagnose", "engine-test"}
-LONG_EXAMPLES = {"inject --all", "schedule --geometry", "engine-test --tables", "export-fmu --part controller"}
+LONG_EXAMPLES = {
+    "inject --all", "schedule --geometry", "engine-test --tables", "export-fmu --part controller",
+    "benchmarks.hidden_effect --logs 40", "benchmarks.hidden_effect --plant",
+}  # fmt: skip
 
 
 def runs(long: bool) -> list[tuple[str, str]]:
