@@ -6,6 +6,7 @@ Tables are in mm and deg, everything returned here is in m and rad (rotor speed 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, overload
 
@@ -197,6 +198,7 @@ def load_schedules(source: str | Path = "schedules.toml") -> Schedules:
 STANDS_FOR = ("lc", "l")  # an offset and a slope of the vane's angle over stroke
 
 
+@lru_cache(maxsize=32)
 def length_tolerances(geometry: Geometry) -> dict[str, float]:
     """How far ``lc`` and ``l`` of each stage may be from the table, mm, when they stand for every length that has a
     tolerance there.

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BaseModel
 
 from plant.curve import LOAD_ADDS, acts
 from plant.effect import KINDS
@@ -46,7 +47,7 @@ from plant.sensors import lag_factor
 from plant.valve import valve_matrix
 from vaneloop.base.compiled import compiled, in_place
 from vaneloop.base.errors import InputError
-from vaneloop.base.tables import Bound, Bounded, Quantity, Table, file_of, load_toml, read
+from vaneloop.base.tables import Bound, Bounded, Quantity, Table, file_of, read
 from vaneloop.base.vanes import VANES, own_rows
 
 __all__ = [
@@ -277,13 +278,19 @@ _TABLES: dict[str, type[PlantTable] | type[ElectromechanicalTable]] = dict(
 )
 
 
+class _AnyTable(BaseModel):
+    """What says of which kind a plant table is."""
+
+    actuator: Any = None
+
+
 def read_plant(source: str | Path = "plant.toml") -> AnyPlantTable:
     """Read a plant table of the kind that its ``[actuator] kind`` names (hydraulic where it names none).
 
     Raises InputError with file, key, value and what is allowed.
     """
     file = file_of(source)
-    actuator: Any = load_toml(file).get("actuator")
+    actuator = read(file, _AnyTable).actuator
     kind = actuator.get("kind", KINDS[0]) if isinstance(actuator, dict) else KINDS[0]
     if not isinstance(kind, str) or kind not in _TABLES:
         raise InputError(f"{file}: actuator.kind (={kind!r}) must be one of {', '.join(KINDS)}")

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from controller import MODES, load_calibration
+from controller import MODES, STATE, flat, load_calibration
 from hil.bus import frames
 from hil.bus.port import Port, open_bus
 from hil.inject.actions import (
@@ -90,26 +90,26 @@ def _lockstep(
     check_stages(name, scenario, plant)
     loop = OnLockstep(scenario, plant, calibration)
     node, ticks, stages = loop.node, round(scenario.duration * 1000.0), len(plant.vanes)
-    z, s = node.loop.state, node.loop.s
-    mode, faults = np.empty(ticks, np.int8), np.empty(ticks, np.int64)
-    values = np.empty((ticks, 5 + stages))
+    z, s = flat(node.loop.state), node.loop.s
+    seen = np.array([STATE.index(n) for n in ("mode", "faults", "x_dem", "x_meas", "i_cmd", "n_dem", "n_r_raw")])
+    firmware, pots = np.empty((ticks, len(seen))), np.empty((ticks, stages))
     counts = np.empty((ticks, len(COUNTS)), np.int64)
     late = np.zeros((ticks, len(loop.heard)), bool)
     to_border = np.array([1e3, 1e3, 1e3, 1.0, 1.0, *([180.0 / np.pi] * stages)])
     for k in range(ticks):
         loop.tick()
-        mode[k], faults[k] = z.mode, z.faults
-        values[k] = (z.x_dem, z.x_meas, z.i_cmd, z.n_dem, z.n_r_raw, *s[places.POT : places.POT + stages, 0])
+        firmware[k], pots[k] = z[seen], s[places.POT : places.POT + stages, 0]
         counts[k] = loop.counts()
         late[k] = [n in loop.missed for n in loop.heard]
         if progress is not None and k % 1000 == 0:
             progress(k / ticks)
     cal = node.loop.calibration.scalars
+    signals = np.hstack([firmware[:, 2:], pots]) * to_border
     trace = Trace(
         np.arange(ticks) * TICK,
-        mode,
-        faults,
-        dict(zip(("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", *plant.vanes), (values * to_border).T, strict=True)),
+        firmware[:, 0].astype(np.int8),
+        firmware[:, 1].astype(np.int64),
+        dict(zip(("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", *plant.vanes), signals.T, strict=True)),
         dict(zip(COUNTS, counts.T, strict=True)),
         dict(zip(loop.heard, late.T, strict=True)),
         (float(cal.stroke_min) * 1e3, float(cal.stroke_max) * 1e3),

@@ -6,6 +6,7 @@ import difflib
 import math
 import re
 import tomllib
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
@@ -109,9 +110,21 @@ def load_toml(file: str | Path) -> dict[str, Any]:
     Raises InputError in one line for what cannot be read, is no TOML, has more than `MOST_BYTES` or a key of more than
     `MOST_PARTS` parts: the parser would take more memory for it than any table of ours is worth.
     """
+    return _parsed(file, _bytes_of(file))
+
+
+def _bytes_of(file: str | Path) -> bytes:
     try:
         with Path(file).open("rb") as f:
-            raw = f.read(MOST_BYTES + 1)
+            return f.read(MOST_BYTES + 1)
+    except OSError as e:
+        raise _refusal(file, f"cannot be read ({e.strerror})") from None
+    except ValueError as e:  # a name with a null byte in it
+        raise _refusal(file, f"not a TOML table ({e})") from None
+
+
+def _parsed(file: str | Path, raw: bytes) -> dict[str, Any]:
+    try:
         if len(raw) > MOST_BYTES:
             raise _refusal(file, f"is longer than a TOML table may be ({MOST_BYTES:,} bytes)")
         stop = next((m for m in _WORDS.finditer(raw) if m.lastgroup), None)
@@ -121,8 +134,6 @@ def load_toml(file: str | Path) -> dict[str, Any]:
                 raise _refusal(file, f"line {line}: {start}... is too long a word; allowed: {MOST_LETTERS:,} letters")
             raise _refusal(file, f"line {line}: key {start}... has too many dotted parts; allowed: {MOST_PARTS}")
         return tomllib.loads(raw.decode("utf-8-sig").replace("\r\n", "\n"))
-    except OSError as e:
-        raise _refusal(file, f"cannot be read ({e.strerror})") from None
     except InputError:
         raise
     except (ValueError, RecursionError) as e:  # TOMLDecodeError, UnicodeDecodeError, a number of thousands of digits
@@ -150,11 +161,19 @@ def read(source: str | Path, model: type[M]) -> M:
     Raises InputError, in one line, naming file, key, value and what is allowed.
     """
     file = file_of(source)
-    data = load_toml(file)
+    return (_shipped if file.parent == path("") else _read)(file, _bytes_of(file), model)
+
+
+def _read(file: Path, raw: bytes, model: type[M]) -> M:
+    data = _parsed(file, raw)
     try:
         return model.model_validate(data)
     except ValidationError as e:
         raise _refusal(file, _complaint(e, model)) from None
+
+
+# Every machine and every controller is made of the same few tables: of a shipped one, what was read is shared.
+_shipped = lru_cache(maxsize=32)(_read)
 
 
 def _refusal(file: str | Path, why: str) -> InputError:
