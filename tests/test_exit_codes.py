@@ -170,7 +170,11 @@ def test_every_module_that_can_be_run_is_in_the_list() -> None:
     assert runs - {"plant.effects_page", "controller.header", "hil.fmu.source"} == set(MODULES)
 
 
-@pytest.mark.parametrize("module", MODULES)
+# doors to the same commands, and processes of the workbench: each begins with a second of imports
+DEAR = {"vaneloop.cli.main", "vaneloop.web.worker", "vaneloop.web.loop", "hil.replay", "hil.inject"}
+
+
+@pytest.mark.parametrize("module", [pytest.param(m, marks=pytest.mark.slow if m in DEAR else ()) for m in MODULES])
 def test_a_module_run_by_itself_leaves_with_70(module: str, tmp_path: Path) -> None:
     """The module in a process of its own, in which one of our functions (or the word that starts it) is broken."""
     what, words = MODULES[module]

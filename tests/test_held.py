@@ -113,7 +113,7 @@ def test_the_jitter_of_a_loggers_stamps_leaves_the_figures(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("suffix", [".asc", ".blf", ".trc", ".mf4"])
 @pytest.mark.parametrize("phase", [0.0, pytest.param(0.5, marks=pytest.mark.slow)])
-def test_every_format_of_frames_says_that_they_are(phase: float, suffix: str, tmp_path: Path) -> None:
+def test_every_format_of_frames_says_that_they_are(phase: float, suffix: str, tmp_path: Path, quick_mdf: None) -> None:
     by_wire(tmp_path / "run.log", "slam", phase, seconds=15.0)
     path = tmp_path / f"run{suffix}"
     write_frames(path, read_candump(tmp_path / "run.log"))
@@ -204,7 +204,7 @@ def test_a_polled_command_is_the_nearest_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet", ".mf4"])
-def test_tables_and_channel_groups_do_not_come_in_frames(suffix: str, tmp_path: Path) -> None:
+def test_tables_and_channel_groups_do_not_come_in_frames(suffix: str, tmp_path: Path, quick_mdf: None) -> None:
     path = tmp_path / f"run{suffix}"
     write_log(path, {"n_dem": Channel(TICKS, 60.0 + TICKS), "x_dem": Channel(TICKS, 20.0 + TICKS)})
     assert not any(c.framed for c in read_log(path).channels.values())

@@ -273,7 +273,7 @@ def test_a_multiplexed_signal_is_read_where_its_selector_says_so(tmp_path: Path)
 
 
 @pytest.mark.parametrize("suffix", [*TABLES, *BOTH])
-def test_a_table_gives_back_every_sample(tmp_path: Path, suffix: str) -> None:
+def test_a_table_gives_back_every_sample(tmp_path: Path, suffix: str, quick_mdf: None) -> None:
     sent = run()
     sent["vigv"] = Channel(np.array([0.0001, 0.5, 2.0]), np.array([1.1, 1 / 3, -5.0]))  # a raster of its own
     write_log(tmp_path / f"a{suffix}", sent)
@@ -285,7 +285,7 @@ def test_a_table_gives_back_every_sample(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", [*BUSES, *BOTH])
-def test_a_bus_log_gives_back_what_the_frames_carry(tmp_path: Path, suffix: str) -> None:
+def test_a_bus_log_gives_back_what_the_frames_carry(tmp_path: Path, suffix: str, quick_mdf: None) -> None:
     sent = run()
     write_log(tmp_path / f"a{suffix}", sent, dbc=DBC)
     log = read_log(tmp_path / f"a{suffix}", dbc=DBC)
@@ -304,7 +304,9 @@ def test_a_bus_log_gives_back_what_the_frames_carry(tmp_path: Path, suffix: str)
     st.sampled_from(TABLES),
 )
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(50))
-def test_any_samples_survive_a_table(tmp_path: Path, points: list[tuple[float, float]], suffix: str) -> None:
+def test_any_samples_survive_a_table(
+    tmp_path: Path, quick_mdf: None, points: list[tuple[float, float]], suffix: str
+) -> None:
     t, values = np.array(sorted(points)).T
     write_log(tmp_path / f"any{suffix}", {"n_dem": Channel(t, values), "x_dem": Channel(t[:1] + 0.5, values[:1])})
     log = read_log(tmp_path / f"any{suffix}")
@@ -567,7 +569,7 @@ def test_a_can_name_may_carry_its_message(tmp_path: Path) -> None:
     assert "close: VGV_STATUS.x_lvdt" in line
 
 
-def test_an_mdf_name_may_carry_its_group(tmp_path: Path) -> None:
+def test_an_mdf_name_may_carry_its_group(tmp_path: Path, quick_mdf: None) -> None:
     import asammdf
 
     t = np.arange(20) * 0.1

@@ -206,7 +206,9 @@ def test_frames_under_an_identifier_that_only_greater_machines_use_are_others(ma
 
 @pytest.mark.parametrize("n", [1, 4, 8])
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_logs_of_every_format_hold_the_machine_s_stages(made: Any, tmp_path: Path, suffix: str, n: int) -> None:
+def test_logs_of_every_format_hold_the_machine_s_stages(
+    made: Any, tmp_path: Path, suffix: str, n: int, quick_mdf: None
+) -> None:
     plant, calibration = made(n)
     columns = lockstep(STIMULUS, plant=plant, calibration=calibration, duration=2.0, hashed=False).columns
     given = {k: Channel(columns["t"], v) for k, v in columns.items() if k not in ("t", "n_engine")}

@@ -368,7 +368,9 @@ def test_a_workbook_is_refused_with_what_to_do(tmp_path: Path) -> None:
 
 @given(tables())
 @settings(max_examples=examples(2), suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_channels_of_mdf_3_are_those_that_asammdf_reads(tmp_path: Path, columns: dict[str, list[float]]) -> None:
+def test_channels_of_mdf_3_are_those_that_asammdf_reads(
+    tmp_path: Path, quick_mdf: None, columns: dict[str, list[float]]
+) -> None:
     with asammdf.MDF(version="3.30") as mdf:
         t = np.array(columns["t"])
         mdf.append([asammdf.Signal(np.array(v), t, name=k) for k, v in columns.items() if k != "t"])
