@@ -407,7 +407,7 @@ def test_a_worker_that_stands_still_is_replaced_and_does_no_harm(
     assert [tuple(r.values()) for r in rows(folder)] == undisturbed
 
 
-@pytest.mark.parametrize("moment", range(1, 13))
+@pytest.mark.parametrize("moment", [pytest.param(m, marks=pytest.mark.slow if m % 3 else ()) for m in range(1, 13)])
 def test_a_worker_may_stand_still_at_any_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int) -> None:
     """Another takes its chunk over, finishes it and clears up; then the first one goes on where it stood."""
     from vaneloop.fleet import files, folder, worker

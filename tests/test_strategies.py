@@ -83,8 +83,16 @@ def test_potentiometers_that_fail_make_no_step(failure: str) -> None:
     assert np.abs(out.offset).max() <= 0.75 + 1e-9 and np.abs(out.width).max() <= 1.2 + 1e-9
 
 
-@pytest.mark.parametrize("stages", [("vigv",), ("vgv1", "vgv2"), ("vigv", "vgv2")])
-@pytest.mark.parametrize("failure", ["no signal", "jump of 2 deg"])
+@pytest.mark.parametrize(
+    ("failure", "stages"),
+    [
+        ("no signal", ("vigv",)), ("jump of 2 deg", ("vgv1", "vgv2")),
+        *(pytest.param(f, s, marks=pytest.mark.slow) for f, s in (
+            ("no signal", ("vgv1", "vgv2")), ("no signal", ("vigv", "vgv2")), ("jump of 2 deg", ("vigv",)),
+            ("jump of 2 deg", ("vigv", "vgv2")),
+        )),
+    ],
+)  # fmt: skip
 def test_one_or_two_potentiometers_that_fail_make_no_step(failure: str, stages: tuple[str, ...]) -> None:
     f, out = failed(failure, "in motion", stages)
     assert f.step <= 0.2 and f.mean_abs < f.mean_abs_dual
