@@ -376,11 +376,10 @@ def test_a_bad_file_gets_the_command_lines_one_line(server: Server, page: Any, t
     done = subprocess.run(words, cwd=server.folder, env=server.environment, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and done.stderr.strip().splitlines()[-1] == said
 
-    evil = tmp_path / "model.py"
-    evil.write_text(f"open({str(tmp_path / 'executed')!r}, 'w')")
-    page.locator("input[type=file]").first.set_input_files(evil)
+    strange = tmp_path / "model.exe"
+    strange.write_bytes(b"MZ")
+    page.locator("input[type=file]").first.set_input_files(strange)
     page.get_by_text("this file cannot be taken").wait_for()
-    assert not (tmp_path / "executed").exists()
     junk = tmp_path / "junk.parquet"
     junk.write_bytes(b"PAR1" + bytes(range(256)) * 40 + b"PAR1")
     page.locator("input[type=file]").first.set_input_files(junk)
@@ -553,7 +552,7 @@ def test_a_worker_takes_the_process_that_is_loaded_and_what_that_does_first_is_t
         loaded = spare._ready[0].pid
         w = Worker(spare=spare)
         try:
-            asked = asyncio.ensure_future(w.call("offers", "opening the file", path=str(file), dbc=None))
+            asked = asyncio.ensure_future(w.call("offers", "opening the file", words=[str(file)]))
             await asyncio.sleep(0)
             assert w.process is not None and w.process.pid == loaded
             w._progress(LOADING, None, "compiling ...")
@@ -587,6 +586,156 @@ def test_the_form_says_the_options_of_a_command(tmp_path: Path) -> None:
         "a.csv", "--map", "N1=n_dem", "--unit", "n_dem=rpm", "--design-rpm", "38000", "--mapping", "bench.toml",
         "--no-guess",
     ]  # fmt: skip
+
+
+def amplifier(folder: Path) -> list[str]:
+    """An amplifier that rectifies, the model that knows only its gain, and how a log that has another name for its
+    input is held against that; as the words of a command.
+    """
+    t = np.arange(0.0, 10.0, 0.02)
+    u = np.sin(0.4 * t) + 0.7 * np.sin(1.7 * t + 1.0)
+    y = np.abs(2.0 * u) + 0.01 * np.random.default_rng(1).standard_normal(len(t))
+    np.savetxt(folder / "amplifier.csv", np.column_stack([t, u, y]), delimiter=",", header="t,Drive,y", comments="")
+    (folder / "amplifier.py").write_text(
+        "from vaneloop import System, unknown\n"
+        "system = System('amplifier', 'static', lambda u, p: p.gain * u.u, inputs={'u': 'V'}, outputs={'y': 'V'},\n"
+        "                parameters=[unknown('gain', 1.0, '-')], places=['output'])\n"
+    )
+    return [str(folder / "amplifier.csv"), "--map", "Drive=u", "--system", str(folder / "amplifier.py")]
+
+
+def test_a_model_of_one_s_own_gets_the_answers_of_the_commands(tmp_path: Path) -> None:
+    """What the page shows is what the verbs say, and what went to the page and back serves as well."""
+    import pickle
+
+    import vaneloop
+    from vaneloop.verbs.search import read_record
+    from vaneloop.web import worker
+
+    words, told = amplifier(tmp_path), lambda *_: None
+    seen = worker.look(told, words)
+    assert seen["ours"] == {"u": "V", "y": "V"} and seen["signals"]["u"][0] == "Drive"
+    assert {k: unit for k, (unit, _, _) in worker.preview(told, words)["channels"].items()} == seen["ours"]
+    compared, diagnosed = (pickle.loads(pickle.dumps(f(told, words))) for f in (worker.compare, worker.diagnose))
+    system = vaneloop.load_system(words[-1])
+    record, _ = read_record(words[0], system, mapping={"Drive": "u"})
+    assert compared["verdict"] == vaneloop.compare(record, system).sentence()
+    answer = vaneloop.diagnose(record, system)
+    assert answer.effects == ["y.absolute_value"] and diagnosed["verdict"] == answer.sentence()
+    assert {**diagnosed["json"], "elapsed_s": 0} == {**answer.to_dict(), "elapsed_s": 0}
+    fitted = worker.refit(told, words, "amplifier", ("y.absolute_value",))
+    better = vaneloop.extend(record, ["y.absolute_value"], system)
+    assert fitted["result"].error_after.tolist() == [better.rows()[0]["error_after"]]
+    share = fitted["bounds"]["y.absolute_value"]["share"]
+    assert (share.value, share.low, share.high) == (0.0, 0.0, 1.0)
+    given = {"stage": "amplifier", "theta": fitted["theta"], "floor": fitted["floor"]}
+    worse = worker.hand(told, words, **given, values={"y.absolute_value": {"share": 0.5}})
+    assert worse["rms"]["y"] > 10.0 * better.rows()[0]["error_after"]
+    page = Path(worker.report(told, words, diagnosed["diagnosis"], str(tmp_path / "page.html"), "vaneloop diagnose"))
+    assert answer.sentence() in page.read_text(encoding="utf-8")
+
+
+def test_no_code_of_a_model_runs_before_the_user_has_allowed_what_it_says_now(tmp_path: Path) -> None:
+    from vaneloop.web.chosen_log import receive
+    from vaneloop.web.jobs import WorkError
+    from vaneloop.web.server import models_in
+    from vaneloop.web.session import LogFile, Session
+
+    ran = tmp_path / "ran"
+    model = tmp_path / "mine.py"
+    model.write_text(f"open({str(ran)!r}, 'w')\nfrom vaneloop import System\nsystem = System(name='a')\n")
+    (tmp_path / "no_model.py").write_text(f"open({str(ran)!r}, 'w')\n")
+    found = {m.name: m for m in models_in(tmp_path)}
+    assert "no_model.py" not in found and found["example: tank.py"].shipped and not found["mine.py"].shipped
+    s = Session("x", tmp_path / "0123456789abcdef", [], models=list(found.values()))
+    s.hold_against(found["example: tank.py"])
+    assert s.asked is None and s.choice.system == found["example: tank.py"]
+    s.choose(found["mine.py"])
+    assert s.asked == found["mine.py"] and s.choice.system == found["example: tank.py"]
+    s.refuse()
+    assert s.asked is None and s.choice.system == found["example: tank.py"]
+    s.choose(found["mine.py"])
+    s.allow()
+    assert s.asked is None and s.choice.system == found["mine.py"] and not ran.exists()
+    s.choice.file = LogFile(tmp_path / "a.csv", "a.csv", "a.csv")  # as when it is read
+    assert s.words() == [str(tmp_path / "a.csv"), "--system", str(model)]
+    model.write_text(model.read_text() + "# more\n")
+    with pytest.raises(WorkError, match=r"mine\.py: has changed since its code was allowed to run"):
+        s.words()
+    s.choice.file = None
+    s.hold_against(None)
+    assert s.asked is s.choice.system is None
+
+    class Upload:
+        """What the page gets of a file that is dropped."""
+
+        class file:
+            name = "other.py"
+
+    s.takes_code = False  # elsewhere than on loopback a token is no right to run code here
+    assert asyncio.run(receive(s, Upload, "log", own=True)) is None  # type: ignore[arg-type]
+    assert "is code, which is taken from this machine only" in s.errors["log"] and not ran.exists()
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_model_of_one_s_own_from_its_file_to_the_error_at_the_noise(
+    server: Server, page: Any, tmp_path: Path
+) -> None:
+    """The way of the vane chain: model and log, names, where, what, a switch, the model extended, compared again."""
+    page.goto(server.url)
+    tab_to(page, ".choose-model input")
+    page.keyboard.press("Enter")
+    page.get_by_role("option", name="example: tank.py").wait_for()
+    chosen = "[...document.querySelectorAll('[role=option]')].findIndex((o) => o.innerText.includes('tank.py'))"
+    for _ in range(page.evaluate(chosen)):
+        page.keyboard.press("ArrowDown")
+    page.keyboard.press("Enter")
+    choose(page, "example: tank.csv")
+    page.get_by_text("fails most in the tank subsystem").wait_for()
+    tab_to(page, "[aria-label^='failure map']")
+    for key in ("ArrowDown", "ArrowRight", "Enter"):
+        page.keyboard.press(key)
+    page.wait_for_function(SHOWS_4_S.replace("- 4)", "- 40)"))  # twenty samples to each side
+    tab_to(page, ".find-missing")
+    page.keyboard.press("Enter")
+    page.get_by_text("The tank subsystem lacks level.square_root").first.wait_for()
+    wait_ratio(page, "< 1.1")
+    tab_to(page, "[aria-label='level.square_root']")
+    page.keyboard.press(" ")
+    wait_ratio(page, "> 50")
+    page.keyboard.press(" ")
+    wait_ratio(page, "< 1.1")
+    looks(page, "own_model")
+    page.get_by_role("button", name="Extended model").click()
+    page.get_by_role("button", name="Go on with this model").click()
+    page.locator(".verdict.good", has_text="fits").wait_for()
+    assert re.search("--system .*tank.py --model extended.toml", page.locator(".cmd code").first.inner_text())
+
+    # a file of the user's own: nothing of it runs before the click; its log calls the input otherwise
+    ran = tmp_path / "ran"
+    amplifier(tmp_path)
+    model = tmp_path / "amplifier.py"
+    model.write_text(f"open({str(ran)!r}, 'w')\n" + model.read_text())
+    upload = page.locator("input[type=file]").first
+    upload.set_input_files(model)
+    page.get_by_text("amplifier.py is code").wait_for()
+    assert not violations(page, AXE) and not ran.exists()
+    tab_to(page, ".leave-code")
+    page.keyboard.press("Enter")
+    page.get_by_text("amplifier.py is code").wait_for(state="detached")
+    upload.set_input_files(model)
+    tab_to(page, ".run-code")
+    page.keyboard.press("Enter")
+    page.get_by_role("alert").filter(has_text="tank.csv: ").wait_for()  # the log of the other model has no u
+    upload.set_input_files(tmp_path / "amplifier.csv")
+    page.get_by_role("alert").filter(has_text="amplifier.csv: ").wait_for()  # one line: it has no u
+    assert ran.exists() and "Traceback" not in page.locator("body").inner_text()
+    page.get_by_label("name of u in the log").fill("Drive")
+    page.keyboard.press("Enter")
+    page.get_by_text("fails most in the amplifier subsystem").wait_for()
+    page.get_by_role("button", name="Find the missing physics").click()
+    page.get_by_text("The amplifier subsystem lacks y.absolute_value").first.wait_for()
 
 
 IN_ONE_TEST = ("locate", "replay", "extend", "diagnose", "experiment")  # the others where they are made anyway

@@ -7,6 +7,8 @@ from __future__ import annotations
 import json
 import re
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -510,3 +512,13 @@ def test_rates_of_a_spline_are_scipy_s(samples: int) -> None:
     rates = SplineRates(t)
     assert np.allclose(rates(u), CubicSpline(t, u, axis=1)(t, 1), rtol=1e-9, atol=1e-9)
     assert np.array_equal(rates(u[1]), rates(u)[1])
+
+
+def test_the_example_is_the_one_that_the_page_shows(tmp_path: Path) -> None:
+    """The tank of docs/your_own_model.md: its script writes the log, and its model is the file, but for the title."""
+    page = PAGE.read_text(encoding="utf-8")
+    script, model = re.findall(r"```python\n(# (?:make_logs|tank)\.py\n.*?)```", page, re.DOTALL)
+    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, check=True)
+    assert (tmp_path / "tank.csv").read_bytes() == (PAGE.parents[1] / "examples" / "tank.csv").read_bytes()
+    title, _, rest = (PAGE.parents[1] / "examples" / "tank.py").read_text(encoding="utf-8").partition("\n\n")
+    assert title.startswith('"""A tank') and model.partition("\n")[2] == rest

@@ -114,6 +114,7 @@ def survey(
     mapping_file: str | Path | None = None,
     tables: Files | None = None,
     part: int = 0,
+    signals: Mapping[str, str] = UNITS,
 ) -> Survey:
     """Look at a log as `read_log` would read it with the same arguments; a log that cannot be read is shown with its
     complaint.
@@ -121,11 +122,11 @@ def survey(
     Raises LogError only for a file that cannot be opened at all, NoTime for a table without a time.
     """
     path = Path(path)
-    out = open_log(path, dbc, mapping, units, design_rpm, UNITS, guess, mapping_file, tables or {}, part)
+    out = open_log(path, dbc, mapping, units, design_rpm, signals, guess, mapping_file, tables or {}, part)
     rows, damaged = [], False
     if isinstance(out.source, Table):
         rows.append(_time(path, out.source, out.units, {*(mapping or {}), *(mapping or {}).values()}))
-    for signal in UNITS:
+    for signal in signals:
         g = out.guesses.made.get(signal)
         stated = signal in out.named and g is None
         keys = [g.name] if g else find(out.source, out.named.get(signal, signal), stated)
@@ -136,7 +137,7 @@ def survey(
         except LogError:
             damaged = True
             continue
-        unit = out.units.get(signal, s.unit) or UNITS[signal]
+        unit = out.units.get(signal, s.unit) or signals[signal]
         how = "guessed" if g else "stated" if stated else "named"
         rows.append(_row(signal, keys[0], unit, how, g.confidence if g else 1.0, g.why if g else "", s.values))
     used = {r.name for r in rows}
@@ -149,14 +150,14 @@ def survey(
     try:
         notes = read_log(
             path, dbc=dbc, mapping=mapping, units=units, design_rpm=design_rpm, require=(), guess=guess,
-            mapping_file=mapping_file, tables=tables, part=part,
+            mapping_file=mapping_file, tables=tables, part=part, signals=signals,
         ).notes  # fmt: skip
     except InputError as e:
         complaint = str(e)
     if not complaint and rows and not any(r.curve.size for r in rows):
         complaint = f"{path}: has no sample"
     if not complaint and not any(r.signal != "t" for r in rows):
-        complaint = f"{path}: none of its names is a signal of ours ({', '.join(UNITS)}); --map NAME=signal names one"
+        complaint = f"{path}: none of its names is a signal of ours ({', '.join(signals)}); --map NAME=signal names one"
     return Survey(
         str(path), rows, open_, other, notes, complaint, out.design_rpm,
         suggested, out.dbc, damaged and bool(complaint),

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 
 from hil.logs.mapping import write_mapping
 from hil.logs.survey import sparkline, survey
 from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
+from vaneloop.base.signals import UNITS
 from vaneloop.cli import options
+from vaneloop.identification import load_system
+from vaneloop.verbs.parts import signals_of
 
 __all__ = ["DESCRIPTION", "add_options", "command"]
 
@@ -20,6 +25,7 @@ examples:
   vaneloop map examples/hidden_effect.parquet
   vaneloop map BENCH.csv --design-rpm 38000 --out bench.toml
   vaneloop replay BENCH.csv --mapping bench.toml
+  vaneloop map examples/tank.csv --system examples/tank.py
   vaneloop map --check examples/engine_run.blf   # the same in python-can, cantools, asammdf?
 
 exit codes: 0 the log can be read so, 1 a line says what is missing or another reader finds something else, 2 bad
@@ -30,6 +36,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     options.add_log_options(parser)
     options.add_tables_option(parser, plant=False)
+    parser.add_argument(
+        "--system", metavar="MY.py", help="Python file with a vaneloop.System in it, whose channels are looked for"
+    )
     terminal.add_output_options(parser)
     parser.add_argument("--out", metavar="F.toml", help="write the mapping file")
     parser.add_argument(
@@ -41,7 +50,7 @@ def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     reading = options.log_options(args)
     options.warm_up_for(args)
-    seen = survey(args.log, **reading)
+    seen = survey(args.log, **reading, signals=_signals(args.system))
     rows = [
         [
             r.signal, r.name, r.unit, f"{100 * r.confidence:.0f} %" if r.how == "guessed" else r.how,
@@ -81,3 +90,13 @@ def command(args: argparse.Namespace) -> int:
         write_mapping(args.out, seen.bench(), remarks, head)
         terminal.say(args, f"mapping: {args.out}")
     return 1 if seen.complaint or unlike else 0
+
+
+def _signals(path: str | None) -> Mapping[str, str]:
+    """What is looked for, name -> unit: our signals, or the channels of a model of the user's own."""
+    if path is None:
+        return UNITS
+    system = load_system(path)
+    if system.read is not None:
+        raise InputError(f"--system {path}: has a read() of its own for its logs; no name is mapped for it")
+    return signals_of(system)

@@ -11,7 +11,7 @@ from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.base.spans import is_span
 from vaneloop.cli import options
-from vaneloop.identification import StageError, load_system
+from vaneloop.identification import StageError, System, load_system
 from vaneloop.identification.user_models.by_log import load_model_of
 from vaneloop.pages.by_log import heads, short_names
 from vaneloop.pages.story import sized
@@ -19,7 +19,7 @@ from vaneloop.verbs import learn, search
 from vaneloop.verbs.parts import split
 from vaneloop.verbs.search import read_record
 
-__all__ = ["add_options", "ask", "asked", "show", "system_of"]
+__all__ = ["add_options", "ask", "asked", "logs_of", "show", "system_of"]
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -85,12 +85,17 @@ def ask(args: argparse.Namespace, verb: str, **more: Any) -> Any:
             added = before.model_copy(update={"curves": {**before.curves, **law.curves}})
             own = [n for n in law.effects if n not in before.effects]  # and the laws of the library beside them
             more["effects"] = [n for e in more["effects"] for n in (own if e == path else [e])]
-        logs = [_record(args, system, p) for p in [args.log, *(p for group in args.also for p in group)]]
-        fit, parts, others = split([x for group in args.fit for x in group], options.parts_to_test(args))
-        test = [*parts, *(_record(args, system, p) for p in others)]
+        logs, fit, test = logs_of(args, system)
         return ask_it(logs, model=system, fit=fit, test=test, added=added, **more)
     except StageError as e:
         raise InputError(str(e)) from None
+
+
+def logs_of(args: argparse.Namespace, system: System) -> tuple[list[Any], list[Any], list[Any]]:
+    """The logs that ``args`` name, the parts of the first that are fitted, and what is to test: parts and logs."""
+    logs = [_record(args, system, p) for p in [args.log, *(p for group in args.also for p in group)]]
+    fit, parts, others = split([x for group in args.fit for x in group], options.parts_to_test(args))
+    return logs, fit, [*parts, *(_record(args, system, p) for p in others)]
 
 
 def _record(args: argparse.Namespace, system: Any, path: str) -> Any:

@@ -55,4 +55,9 @@ def _range(r: Regime, b: int) -> str:
     """The values of a bin, short enough for a cell."""
     if r.condition == "direction":
         return r.place(b).partition(" ")[2]
-    return f"{r.edges[b]:.3g} … {r.edges[b + 1]:.3g}"
+    return f"{_short(r.edges[b])} … {_short(r.edges[b + 1])}"
+
+
+def _short(v: float) -> str:
+    """Three digits, those before the point all."""
+    return f"{v:.0f}" if 1e3 <= abs(v) < 1e6 else f"{v:.3g}"

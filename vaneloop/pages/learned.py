@@ -20,7 +20,7 @@ from vaneloop.pages.story import floors
 from vaneloop.pages.style import Tone, capital, number
 from vaneloop.pages.surface import BEYOND, map_figure, sections_figure
 
-__all__ = ["COLUMNS", "HOW", "about", "curve_figure", "formula_rows", "learned_page", "visited_figure"]
+__all__ = ["BAND", "COLUMNS", "HOW", "about", "curve_figure", "formula_rows", "learned_page", "visited_figure"]
 
 TONES: dict[str, Tone] = {
     "learned": "good", "none": "good", "named": "neutral", "unknown": "bad",

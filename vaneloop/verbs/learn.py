@@ -264,10 +264,22 @@ def learn(
         machine = model or Machine()
         chain, name = chain_for(log, machine, fit, test)
         return learned(not_given(chain, without), name, machine.added, workers, tell, None, shape, formulas)
-    diagnosed = diagnose(log, model, fit=fit, test=test, added=added, without=without, progress=lambda f: tell(0.5 * f))
+    found = diagnose(log, model, fit=fit, test=test, added=added, without=without, progress=lambda f: tell(0.5 * f))
+    return learned_system(found, added, lambda f: tell(0.5 + 0.5 * f), shape, formulas)
+
+
+def learned_system(
+    found: Diagnosed,
+    added: Model | None = None,
+    progress: Callable[[float], None] | None = None,
+    shape: Sequence[str] = (),
+    formulas: bool = True,
+) -> Learned:
+    """`learn` of logs of a system that have been diagnosed."""
+    tell = progress or (lambda _: None)
     try:
-        alone = _learned(diagnosed, added, lambda f: tell(0.5 + 0.25 * f), shape, formulas)
-        beside = _beside_named(diagnosed, alone, lambda f: tell(0.75 + 0.25 * f), shape, formulas)
+        alone = _learned(found, added, lambda f: tell(0.5 * f), shape, formulas)
+        beside = _beside_named(found, alone, lambda f: tell(0.5 + 0.5 * f), shape, formulas)
         tell(1.0)
         return beside or alone
     except StageError as e:

@@ -25,7 +25,18 @@ if TYPE_CHECKING:
     from vaneloop.verbs.machine import Machine
     from vaneloop.verbs.replay import LogLike
 
-__all__ = ["LogsLike", "Parts", "Tested", "bind_parts", "part_of", "read_record", "records_of", "split", "tested"]
+__all__ = [
+    "LogsLike",
+    "Parts",
+    "Tested",
+    "bind_parts",
+    "part_of",
+    "read_record",
+    "records_of",
+    "signals_of",
+    "split",
+    "tested",
+]
 
 Part: TypeAlias = "tuple[float | None, float | None] | str"  # of a log: from, to in s; None an open end
 Parts: TypeAlias = "Part | Sequence[Part]"
@@ -127,6 +138,13 @@ def _inside(t: Array, span: Span, name: str) -> Array:
     return np.asarray(use)
 
 
+def signals_of(system: System) -> dict[str, str]:
+    """The channels that a system looks for in a log, name -> unit; "": any."""
+    motion = {c: system.units.get("position", "") for c in (system.position,) if c}
+    motion |= {c: "" for c in (system.velocity,) if c}
+    return {**motion, **system.inputs, **system.outputs}
+
+
 def read_record(log: LogLike, system: System, **reading: Any) -> tuple[Record, list[str]]:
     """Read a log as a system wants it, by its own ``read`` or by ours; return it and what there is to note.
 
@@ -135,10 +153,7 @@ def read_record(log: LogLike, system: System, **reading: Any) -> tuple[Record, l
     """
     if system.read is not None and isinstance(log, str | Path):
         return Record(Path(log).name, *_by_its_own_reader(str(log), system)), []
-    motion = {c: system.units.get("position", "") for c in (system.position,) if c} | {
-        c: "" for c in (system.velocity,) if c
-    }
-    signals = {**motion, **system.inputs, **system.outputs}
+    signals = signals_of(system)
     needed = [c for c in signals if c not in system.optional()]
     if isinstance(log, Log):
         read = _in_units(log, signals, needed)

@@ -70,7 +70,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Diagnosed", "Experiment", "Extended", "Stages", "chain_for", "compare", "diagnose", "experiment", "extend",
-    "locate", "read_record",
+    "locate", "logs_for", "read_record",
 ]  # fmt: skip
 
 Progress = Callable[[float], None]
@@ -360,7 +360,9 @@ def _records(logs: LogsLike, system: System) -> list[Record]:
     return [x if isinstance(x, Record) else read_record(x, system)[0] for x in several]
 
 
-def _logs(log: LogsLike, system: System, fit: Parts, test: Parts | LogsLike, added: Model | None) -> tuple[Logs, str]:
+def logs_for(
+    log: LogsLike, system: System, fit: Parts, test: Parts | LogsLike, added: Model | None
+) -> tuple[Logs, str]:
     """The records held against a system, and the first one's name."""
     to_fit, to_test, others = split(fit, test)
     try:
@@ -422,11 +424,15 @@ def compare(
     Channels('hidden_effect.parquet', 2,550 rows, 4.51 to 30 s: vigv [deg])
     """
     if isinstance(model, System):
-        logs, name = _logs(log, model, fit, test, added)
-        located = locate_stages(logs.fitted.stages)
-        return Stages(logs.fitted, located, name, ByLog.of(logs, as_given(logs, located[0].fit), added))
+        return compared_system(*logs_for(log, model, fit, test, added), added)
     chain, name = chain_for(log, model or Machine(), fit, test)
     return compared(chain, name, progress=progress)
+
+
+def compared_system(logs: Logs, log: str, added: Model | None = None) -> Stages:
+    """`compare` of logs that have been put into a system."""
+    located = locate_stages(logs.fitted.stages)
+    return Stages(logs.fitted, located, log, ByLog.of(logs, as_given(logs, located[0].fit), added))
 
 
 def compared(chain: Chain, log: str, verb: str = "compare", progress: Progress | None = None) -> Stages:
@@ -521,13 +527,23 @@ def diagnose(
     """
     if isinstance(model, System):
         model = replace(model, without=(*model.without, *without))
-        logs, name = _logs(log, model, fit, test, added)
-        d = search(logs.fitted.stages, None, progress, 1, logs.judged())
-        by_log = ByLog.of(logs, d.stages[0], added)
-        d.notes = by_log.notes
-        return Diagnosed(logs.fitted, d, name, by_log)
+        return diagnosed_system(*logs_for(log, model, fit, test, added), added, progress)
     chain, name = chain_for(log, model or Machine(), fit, test)
     return diagnosed(not_given(chain, without), name, workers, progress)
+
+
+def diagnosed_system(
+    logs: Logs,
+    log: str,
+    added: Model | None = None,
+    progress: Progress | None = None,
+    news: Callable[[News], None] | None = None,
+) -> Diagnosed:
+    """`diagnose` of logs that have been put into a system; ``news`` takes what is being tried meanwhile."""
+    d = search(logs.fitted.stages, None, progress, 1, logs.judged(), news)
+    by_log = ByLog.of(logs, d.stages[0], added)
+    d.notes = by_log.notes
+    return Diagnosed(logs.fitted, d, log, by_log)
 
 
 def not_given(chain: Chain, effects: Sequence[str]) -> Chain:
@@ -608,7 +624,7 @@ def extend(
     if not effects:
         raise InputError("effects is empty; allowed: at least one effect, such as those that diagnose names")
     if isinstance(model, System):
-        return _extended(*_logs(log, model, fit, test, added), effects, added)
+        return _extended(*logs_for(log, model, fit, test, added), effects, added)
     machine = model or Machine()
     wanted, more = with_law_files(effects, machine)
     known([e for e in wanted if e not in more.curves])

@@ -303,9 +303,10 @@ export default {
       });
     },
     moment(t) {
-      // show a moment: two seconds of a log to each side, with the cursor's reference on it; a live chart is held by the server
+      // show a moment of a log with what is near it to each side; a live chart is held by the server
       this.at = t;
-      if (!this.live) this.look(t - 2, t + 2);
+      const near = this.head?.near ?? 2;
+      if (!this.live) this.look(t - near, t + near);
       this.plots.forEach((p) => p.redraw(false));
       if (t !== null) this.$el.scrollIntoView({ behavior: "smooth", block: this.live ? "nearest" : "center" });
     },

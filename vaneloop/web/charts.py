@@ -46,6 +46,7 @@ __all__ = [
 
 Array = np.ndarray
 MOST_BANDS = 400
+NEAR, NEAR_SAMPLES = 2.0, 20  # s, and samples, to each side of a moment that is shown
 MODE_ROLES = {"DEGRADED": "model", "FAIL_SAFE": "bad"}  # modes that are drawn as bands
 MOST_POINTS = 4000  # a line and view, whatever the browser asks for
 
@@ -151,7 +152,9 @@ def view(curves: Curves, start: float | None, end: float | None, pixels: int) ->
         )
         body += [np.ascontiguousarray(a, dtype="<f8").tobytes() for a in (x, *lines)]
     span = [low, high if high > low else low + 1.0] if np.isfinite(low) else [0.0, 1.0]
-    more = {"marks": [[m.t, m.text] for m in curves.marks]}
+    steps = [float(np.median(np.diff(p.t))) for p in curves.panels if len(p.t) > 1]
+    more: dict[str, Any] = {"near": max([NEAR, *(NEAR_SAMPLES * s for s in steps)])}
+    more |= {"marks": [[m.t, m.text] for m in curves.marks]}
     more |= {"bands": [[b.start, b.end, b.text, b.role] for b in curves.bands]}
     head = json.dumps({"panels": heads, "span": span, "key": curves.key, **more}).encode()
     return struct.pack("<I", len(head)) + head + bytes(-(4 + len(head)) % 8) + b"".join(body)
@@ -197,9 +200,13 @@ class Over:
 
 
 def of_log(
-    channels: Channels, key: str, over: Sequence[Over] = (), marks: Sequence[Mark] = (), spans: Sequence[Band] = ()
-) -> Curves:
-    """All channels of a log, one below the other, holes open; those of other logs at the first one's samples."""
+    channels: Channels, key: str, over: Sequence[Over] = (), marks: Sequence[Mark] = (), spans: Sequence[Band] = (),
+    modes: bool = True,
+) -> Curves:  # fmt: skip
+    """All channels of a log, one below the other, holes open; those of other logs at the first one's samples.
+
+    modes  ``state`` is the controller's mode: stretches in a mode other than RUN are drawn
+    """
     panels = []
     for name, (unit, t, values) in channels.items():
         x, y = break_at_holes(t, values)
@@ -210,7 +217,7 @@ def of_log(
                 there = np.interp(np.asarray(x), np.asarray(t2) + other.later, v2, np.nan, np.nan)
                 lines.append(Trace(other.name, there, role, dash=dash))
         panels.append(Panel(heading(name, unit), unit, np.asarray(x), lines, height=74, group=GROUP_OF.get(name, "")))
-    if "state" in channels:
+    if modes and "state" in channels:
         _, t, values = channels["state"]
         spans = [*mode_bands(np.asarray(t), np.asarray(values)), *spans]
     return Curves(panels, key, marks, spans)

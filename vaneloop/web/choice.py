@@ -8,27 +8,34 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-__all__ = ["OTHER_SUFFIXES", "Choice", "LogFile", "Overlay", "safe_name"]
+__all__ = ["CODE", "OTHER_SUFFIXES", "Choice", "LogFile", "Overlay", "safe_name"]
 
 OTHER_SUFFIXES = (".dbc", ".toml")  # beside a log: its database, a model file
+CODE = ".py"  # a model of the user's own
 
 
 @dataclass(frozen=True)
 class LogFile:
     """A file that may be chosen: where it is, what the user calls it, and how a command would name it.
 
-    marks  of a run recorded here: s from its start, what was injected then
+    marks    of a run recorded here: s from its start, what was injected then
+    shipped  it came with the workbench: its code is ours
     """
 
     path: Path
     name: str
     word: str
     marks: tuple[tuple[float, str], ...] = ()
+    shipped: bool = False
 
 
 @dataclass
 class Choice:
-    """How the log is read: what the form says."""
+    """What the log is held against, and how it is read: what the form says.
+
+    system  model of the user's own; None: the vane chain of ``tables``
+    model   what is known of either by now: parameters as fitted, effects added
+    """
 
     file: LogFile | None = None
     dbc: LogFile | None = None
@@ -39,6 +46,7 @@ class Choice:
     design_rpm: str = ""
     guess: bool = True
     tables: str | None = None
+    system: LogFile | None = None
 
     def beside(self) -> list[str]:
         """Names of the files that are taken beside the log."""
@@ -52,7 +60,7 @@ class Choice:
         out = self.reading(real)
         if self.model is not None:
             out += ["--model", str(self.model.path) if real else self.model.word]
-        if self.tables is not None:
+        if self.tables is not None and self.system is None:
             out += ["--tables", self.tables]
         return out
 
@@ -76,6 +84,8 @@ class Choice:
             out += ["--mapping", place(self.bench)]
         if not self.guess:
             out += ["--no-guess"]
+        if self.system is not None:
+            out += ["--system", place(self.system)]
         return out
 
 

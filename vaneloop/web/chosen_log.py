@@ -14,11 +14,13 @@ from vaneloop.base.vanes import VANES
 from vaneloop.verbs.machine import files_of
 from vaneloop.web.charts import OVER, Chart
 from vaneloop.web.frame import Live, card, drop, list_of_moments, opened, table
-from vaneloop.web.session import OTHER_SUFFIXES, STOPPED, LogFile, Session, safe_name
+from vaneloop.web.session import CODE, OTHER_SUFFIXES, STOPPED, LogFile, Session, safe_name
 
 __all__ = ["ChosenLog", "receive", "suffixes"]
 
 EXAMPLE = "hidden_effect.parquet"
+VANE_CHAIN = "the vane chain"
+MOST_SHOWN = 200_000  # characters of code
 
 
 def suffixes() -> str:
@@ -26,16 +28,27 @@ def suffixes() -> str:
     return ",".join((*log_suffixes(), *OTHER_SUFFIXES))
 
 
-async def receive(s: Session, e: events.UploadEventArguments, section: str) -> LogFile | None:
+async def receive(s: Session, e: events.UploadEventArguments, section: str, own: bool = False) -> LogFile | None:
     """Keep an uploaded file in the session's private folder; None, and a complaint, where it is of no kind that we
     know.
+
+    own  a model of the user's own is taken too, and for one that has a reader of its own any file as a log
     """
     name = safe_name(e.file.name)
-    if not name.lower().endswith((*log_suffixes(), *OTHER_SUFFIXES)):
-        s.errors[section] = (
+    code = own and name.lower().endswith(CODE)
+    said = ""
+    if code and not s.takes_code:
+        said = (
+            f"{name}: is code, which is taken from this machine only; allowed: a file in the folder that the workbench "
+            f"was started with (--folder)"
+        )
+    elif not code and not name.lower().endswith((*log_suffixes(), *OTHER_SUFFIXES)) and not (own and s.choice.system):
+        said = (
             f"{name}: suffix {name[name.rfind('.') :] if '.' in name else ''!r} is not a log's; allowed: "
             f"{', '.join(log_suffixes())}"
         )
+    if said:
+        s.errors[section] = said
         s.touch(section)
         return None
     folder = s.folder / f"upload{len(list(s.folder.glob('upload*'))) + 1}"
@@ -44,7 +57,9 @@ async def receive(s: Session, e: events.UploadEventArguments, section: str) -> L
     await e.file.save(path)
     path.chmod(0o600)
     file = LogFile(path, name, name)
-    if name.lower().endswith(log_suffixes()):
+    if code:
+        s.models.append(file)
+    elif not name.lower().endswith(OTHER_SUFFIXES):
         s.files.append(file)
     s.touch("files")
     return file
@@ -58,11 +73,23 @@ class ChosenLog:
 
     def card(self) -> None:
         """Drop or choose a log; names and units by form; the preview."""
-        with card("1  The log", "A measured run: any CAN log, MDF4, CSV or Parquet. It stays on this machine."):
+        about = (
+            "A measured run: any CAN log, MDF4, CSV or Parquet. It stays on this machine. It is held against the vane "
+            "chain, or against a model of your own: a Python file with a vaneloop.System in it."
+        )
+        with card("1  The log", about):
             with ui.element("div").classes("two"):
                 with ui.element("div").classes("stackc"):
-                    self.upload = drop("Drop a log here", self.most, suffixes(), self._uploaded, self._rejected)
                     s = self.s
+                    self.upload = drop("Drop a log here", self.most, "", self._uploaded, self._rejected)
+                    self._accept()
+                    self.live.watch(self._accept, "model", of=self.upload)
+                    self.live.part(
+                        self._model, "files", "model", "log",
+                        shows=lambda: (tuple(f.name for f in s.models), s.choice.system, s.asked),
+                    )  # fmt: skip
+                    self.live.complaint("model")
+                    self.live.part(self._asks, "model", shows=lambda: (s.asked,))
                     self.live.part(
                         self._choose, "files", "log", shows=lambda: (tuple(f.name for f in s.files), s.choice.file)
                     )
@@ -107,6 +134,47 @@ class ChosenLog:
             "outlined dense options-dense"
         ).classes("choose")
 
+    def _accept(self) -> None:
+        """What the field takes: logs and what goes beside them; any file where the model may read logs of its own."""
+        self.upload.props["accept"] = "" if self.s.choice.system else f"{suffixes()},{CODE}"
+        self.upload.update()
+
+    def _model(self) -> None:
+        """What the log is held against."""
+        s = self.s
+        options = {-1: VANE_CHAIN, **{i: f.name for i, f in enumerate(s.models)}}
+        at = next((i for i, f in enumerate(s.models) if f == (s.asked or s.choice.system)), -1)
+
+        def chosen(e: events.ValueChangeEventArguments[Any]) -> None:
+            s.hold_against(s.models[e.value] if e.value is not None and e.value >= 0 else None)
+
+        ui.select(options, value=at, label="held against", on_change=chosen).props(
+            "outlined dense options-dense"
+        ).classes("choose-model")
+
+    def _asks(self) -> None:
+        """Whether the code of a model may run."""
+        s = self.s
+        if s.asked is None:
+            return
+        with ui.element("div").classes("verdict asks stackc").props('role="alert"'):
+            ui.label(f"{s.asked.name} is code: it would run on this machine with your rights.").classes("asked")
+            ui.label(
+                "It could read, change or send whatever you may. Nothing of it has run. Run it only if you trust its "
+                "author."
+            ).classes("small")
+            with ui.expansion("Show the code").props("dense").classes("w-full"):
+                text = s.asked.path.read_text(encoding="utf-8", errors="replace")[:MOST_SHOWN]
+                ui.html(
+                    f'<pre class="mono scroll" tabindex="0" role="group" aria-label="code">{html.escape(text)}</pre>',
+                    sanitize=False,
+                )
+            with ui.element("div").classes("rowc"):
+                ui.button("Run it", icon="play_arrow", on_click=s.allow).props(
+                    "outline dense padding='4px 14px'"
+                ).classes("run-code")
+                ui.button("Leave it", on_click=s.refuse).props("flat dense padding='4px 14px'").classes("leave-code")
+
     def _other(self) -> None:
         """Other logs laid over this one."""
         s = self.s
@@ -135,7 +203,7 @@ class ChosenLog:
                 other.props("outlined dense options-dense").style("min-width:240px").classes("other")
 
     async def _uploaded(self, e: events.UploadEventArguments) -> None:
-        file = await receive(self.s, e, "log")
+        file = await receive(self.s, e, "log", own=True)
         self.upload.reset()
         if file is not None:
             self.s.choose(file)
@@ -143,7 +211,8 @@ class ChosenLog:
     def _rejected(self) -> None:
         limit = f"{self.most / 2**20:.0f} MB"
         self.s.errors["log"] = (
-            f"this file cannot be taken: it is larger than {limit}, or no log ({', '.join(log_suffixes())})"
+            f"this file cannot be taken: it is larger than {limit}, or no log ({', '.join(log_suffixes())}) and no "
+            f"model ({CODE})"
         )
         self.s.touch("log")
 
@@ -185,8 +254,12 @@ class ChosenLog:
             ui.label(f"not in the log: {', '.join(absent)}").classes("note")
 
     def _signals(self) -> list[str]:
-        """Signals that this machine has, and those of other machines that the log has or a name was given for."""
+        """Signals that this machine has, and those of other machines that the log has or a name was given for; those of
+        a model of the user's own.
+        """
         s = self.s
+        if s.choice.system is not None:
+            return list(s.seen["ours"]) if s.seen else []
         own = load_geometry(files_of(s.tables)["geometry"]).vanes
         there = {*own, *(s.seen or {}).get("signals", ()), *(s.preview or {}).get("channels", ()), *s.choice.mapping}
         return [n for n in UNITS if n not in VANES or n in there]
@@ -201,6 +274,7 @@ class ChosenLog:
             c.dbc,
             c.model,
             c.bench,
+            c.system,
             tuple(s.offered),
             repr(s.seen),
             c.guess,
@@ -219,7 +293,7 @@ class ChosenLog:
 
         def apply() -> None:
             choice.mapping, choice.units = (
-                {k: v for k in ("t", *UNITS) if (v := draft.get(f"{what} {k}", of.get(k, "")).strip())}
+                {k: v for k in ("t", *seen["ours"]) if (v := draft.get(f"{what} {k}", of.get(k, "")).strip())}
                 for what, of in (("name", choice.mapping), ("unit", choice.units))
             )
             choice.design_rpm = draft.get("rpm", choice.design_rpm)
@@ -258,7 +332,7 @@ class ChosenLog:
                         label = f"name of {signal} in the log"
                         box = field(f"name {signal}", choice.mapping.get(signal, ""), name, label)
                         box.props("list=names-of-the-log")
-                        own = unit or UNITS.get(signal, "s")
+                        own = unit or seen["ours"].get(signal, "s")
                         field(f"unit {signal}", choice.units.get(signal, ""), own, f"unit of {signal} in the log")
                         if how or signal in seen["open"]:
                             ui.html(_curve(curve), sanitize=False)

@@ -26,7 +26,7 @@ only, or on another --host. There is no encryption: on a network that others lis
 instead.
 
 Logs that are uploaded go into a private temporary folder. It is removed at the end, or after a kill at the next start.
-Python models are taken on the command line only.
+A model of your own is code; the page asks before it runs.
 
 examples:
   vaneloop web

@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING
 from nicegui import ui
 
 from vaneloop.base.signals import heading
-from vaneloop.pages.learned import COLUMNS, HOW, about, curve_figure, formula_rows, visited_figure
+from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
+from vaneloop.pages.learned import BAND, COLUMNS, HOW, about, curve_figure, formula_rows, visited_figure
 from vaneloop.pages.story import floors
 from vaneloop.pages.style import capital
+from vaneloop.pages.surface import BEYOND, map_figure, sections_figure
 from vaneloop.web.charts import figure as figure_of
 from vaneloop.web.frame import Live, command_line, dark, table
 
 if TYPE_CHECKING:
+    from vaneloop.identification.unmodelled.learned_law import LearnedLaw
     from vaneloop.web.session import Session
 
 __all__ = ["LearnedPart", "unknown_stages"]
@@ -65,7 +68,7 @@ class LearnedPart:
         s.learned = None
         files = {key: s.anew(key, name) for key, name in FILES.items()}
         learned = await s.search.call(
-            "learn", "learning a law", words=s.choice.words(real=True), diagnosis=d["diagnosis"],
+            "learn", "learning a law", words=s.words(), diagnosis=d["diagnosis"],
             law=str(files["law"]), page=str(files["law-page"]), command=self.command(),
         )  # fmt: skip
         if s.diagnosis is d:
@@ -95,14 +98,19 @@ class LearnedPart:
             with ui.element("div").classes("verdict fell good"):
                 ui.label(f"{floors(law.error_before)} → {floors(law.error_after)} noise floors").classes("v law-error")
                 ui.label(f"{law.name}: held-out error before and after").classes("l")
+            if isinstance(law, LearnedSurface):
+                ui.label(f"{capital(law.sentence())}. {BEYOND} {BAND}").classes("note")
+                with ui.element("div").classes("half"):
+                    figure_of(map_figure(law), dark(s), height=300)
+                    figure_of(sections_figure(law), dark(s), height=300)
+                self._formulas(law)
+                continue
             bars = f"Bars: {heading(law.of, law.of_unit)} of the log."
             ui.label(f"{capital(law.sentence())}. {about(law)} {bars}").classes("note")
             with ui.element("div").classes("half"):
                 figure_of(curve_figure(law), dark(s), height=300)
                 figure_of(visited_figure(law), dark(s), height=300)
-            if law.formulas:
-                ui.label(HOW).classes("note")
-                table(COLUMNS, formula_rows(law), numbers=(1,))
+            self._formulas(law)
         if learned["nearest"] and not learned["laws"]:
             ui.label(f"What came nearest: {', '.join(learned['nearest'])}.").classes("note")
         for note in learned["notes"]:
@@ -115,3 +123,9 @@ class LearnedPart:
         command_line(self.command())
         if "law" in s.saved:
             command_line(s.command("extend", "--effect", FILES["law"], *s.extend_words()))
+
+    def _formulas(self, law: LearnedLaw) -> None:
+        """Closed forms that would do in the law's place."""
+        if law.formulas:
+            ui.label(HOW).classes("note")
+            table(COLUMNS, formula_rows(law), numbers=(1,))

@@ -9,6 +9,7 @@ from nicegui import events, ui
 
 from plant.effects import EFFECTS
 from vaneloop.base.signals import heading
+from vaneloop.identification.candidates.library import LAWS
 from vaneloop.identification.regimes import Located
 from vaneloop.identification.settings import AGREES
 from vaneloop.pages.failures import failure_map, worst_cell
@@ -87,7 +88,7 @@ class _Page:
             live.complaint("compare")
             live.progress("compare")
             hint = ui.label(
-                "Choose a log: each subsystem of the machine is then driven by its own logged inputs and compared."
+                "Choose a log: each subsystem of the model is then driven by its own logged inputs and compared."
             ).classes("soft")
             live.shown(hint, lambda: s.choice.file is None, "compare", "log")
             live.part(self._compared, "compare", shows=lambda: (s.compared,))
@@ -332,7 +333,7 @@ class _Page:
             self.s.switch(name, on)
 
     def _about_effect(self, name: str, found: dict[str, Any], named: dict[str, str], c: Any) -> str:
-        summary = capital(EFFECTS[name].summary) if name in EFFECTS else ""
+        summary = capital(_summary(name))
         if name in found:
             f = found[name]
             text = f"{100 * f.probability:.0f} %: {sizes(f)}"
@@ -398,9 +399,11 @@ class _Page:
                 box.set_text(f"{value:.5g}")
 
     def _slider(self, effect: str, name: str, fitted: float, unit: str, now: float) -> None:
-        p = EFFECTS[effect][name]
-        reach = abs(fitted - p.neutral) or abs(p.high - p.neutral) / 4
-        low, high = max(p.low, min(p.neutral, fitted) - reach), min(p.high, max(p.neutral, fitted) + reach)
+        f = self.s.fitted()
+        assert f is not None
+        p = f.bounds[effect][name]
+        reach = abs(fitted - p.value) or (abs(p.high - p.value) / 4 if math.isfinite(p.high) else 1.0)
+        low, high = max(p.low, min(p.value, fitted) - reach), min(p.high, max(p.value, fitted) + reach)
         with ui.element("div").classes("turn"):
             ui.label(f"{effect}: {heading(name, unit)}, fitted {number(fitted, 4)}").classes("what soft")
             slider = ui.slider(min=low, max=high, step=(high - low) / 400 or 1e-9, value=now).props(
@@ -507,3 +510,11 @@ class _Page:
             command_line(s.command("diagnose", "--report", "diagnosis.html"))
             if s.all_chosen():
                 command_line(s.command("extend", *s.extend_words()))
+
+
+def _summary(name: str) -> str:
+    """What an effect is, in words; "" of a law of the user's own, or one that was learned."""
+    if name in EFFECTS:
+        return EFFECTS[name].summary
+    law = name.rpartition(".")[2]
+    return next((of[law].text for of in LAWS.values() if law in of), "")

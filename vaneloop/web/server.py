@@ -30,11 +30,12 @@ from vaneloop.web.guard import Guard
 from vaneloop.web.jobs import Cancelled, Spare
 from vaneloop.web.lasting import Lasting
 from vaneloop.web.private import private_folder
-from vaneloop.web.session import LogFile, Session
+from vaneloop.web.session import CODE, LogFile, Session
 
 __all__ = ["serve"]
 
 MOST_SESSIONS = 6  # one without an open tab gives way
+MOST_CODE = 1 << 20  # bytes of a Python file that are looked at
 RECONNECT = 60.0  # s that a tab may be out of reach and still counts as open: a browser on a busy machine answers late
 PAGES = ("/", "/schedule", "/run", "/fleet")
 FULL = f"""{MOST_SESSIONS} browsers are at work here, each with an open tab, and that is the limit.
@@ -122,6 +123,18 @@ def logs_in(folder: Path) -> list[LogFile]:
     return out
 
 
+def models_in(folder: Path) -> list[LogFile]:
+    """Models of one's own among the examples and in ``folder``. None is run to find that out."""
+    examples, out = HERE.parent.parent / "examples", []
+    for place in dict.fromkeys([examples, folder.resolve()]):
+        for f in sorted(place.iterdir())[:500] if place.is_dir() else ():
+            if f.suffix.lower() == CODE and f.is_file() and b"System(" in f.read_bytes()[:MOST_CODE]:
+                ours = place == examples
+                name = f"example: {f.name}" if ours else f.name
+                out.append(LogFile(f, name, os.path.relpath(f, folder), shipped=ours))
+    return out
+
+
 def serve(
     sock: socket.socket,
     folder: Path,
@@ -145,12 +158,13 @@ def _serve(
     sock: socket.socket, folder: Path, token: str, most: int, loopback: bool, ready: Callable[[str], None],
     private: Path, tables: str | None, controller: str | None,
 ) -> None:  # fmt: skip
-    files, spare = logs_in(folder), Spare()
+    files, models, spare = logs_in(folder), models_in(folder), Spare()
     spare.refill()  # ready by the time that a log is chosen
 
     def new(key: str) -> Session:
-        session = Session(key, private / secrets.token_hex(8), list(files), tables, controller, spare)
+        session = Session(key, private / secrets.token_hex(8), list(files), tables, controller, spare, models)
         session.extra["served"] = folder
+        session.takes_code = loopback
         return session
 
     sessions = Sessions(new)

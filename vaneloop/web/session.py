@@ -7,23 +7,23 @@ the same, where there is one (docs/workbench.md).
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import re
 import shlex
 import shutil
 from collections import Counter
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from hil.logs.formats import is_framed
-from vaneloop.base.signals import UNITS
 from vaneloop.web import moments
 from vaneloop.web.charts import OVER, Curves, Mark, Over, of_log, of_stage
-from vaneloop.web.choice import OTHER_SUFFIXES, Choice, LogFile, Overlay, safe_name
+from vaneloop.web.choice import CODE, OTHER_SUFFIXES, Choice, LogFile, Overlay, safe_name
 from vaneloop.web.jobs import Cancelled, Job, Spare, Worker, WorkError
 
-__all__ = ["OTHER_SUFFIXES", "STOPPED", "Choice", "LogFile", "Session", "safe_name"]
+__all__ = ["CODE", "OTHER_SUFFIXES", "STOPPED", "Choice", "LogFile", "Session", "safe_name"]
 
 STOPPED = "stopped; nothing is kept of it, start it again when you like"  # in place of a complaint
 LEADERS = 4  # candidate effects whose fits are made ahead
@@ -37,6 +37,7 @@ class Fitted:
     curves: dict[str, Any]
     theta: Any
     floor: Any
+    bounds: dict[str, dict[str, Any]]  # effect -> parameter -> its `Parameter`
 
 
 class Session:
@@ -44,9 +45,13 @@ class Session:
 
     def __init__(
         self, number: str, folder: Path, files: list[LogFile], tables: str | None = None, controller: str | None = None,
-        spare: Spare | None = None,
+        spare: Spare | None = None, models: Sequence[LogFile] = (),
     ):  # fmt: skip
         self.number, self.folder, self.files = number, folder, files  # files: what may be chosen
+        self.models = list(models)  # models of the user's own, and of the examples
+        self.allowed: set[str] = set()  # code that the user lets run, by its digest
+        self.asked: LogFile | None = None  # a model whose code nobody has allowed yet
+        self.takes_code = True  # whether an upload may be code
         self.tables = tables  # folder of the machine's tables; None: the shipped ones
         self.controller = controller and str(
             Path(controller).resolve()
@@ -130,7 +135,7 @@ class Session:
     def clean(self, text: str) -> str:
         """Name files as the user does, not by their private folder."""
         beside = [x for x in (self.choice.dbc, self.choice.model, self.choice.bench) if x is not None]
-        for f in [*self.files, *beside]:
+        for f in [*self.files, *self.models, *beside]:
             text = text.replace(str(f.path), f.name)
         return text.replace(str(self.folder) + "/", "")
 
@@ -163,7 +168,12 @@ class Session:
     # ---- the log
 
     def choose(self, file: LogFile) -> None:
-        """Take a log; a database, a model file or a mapping file is taken beside it, or for the first log to come."""
+        """Take a log; a database, a model file or a mapping file is taken beside it, or for the first log to come. A
+        model of the user's own is taken as `hold_against` takes it.
+        """
+        if file.path.suffix.lower() == CODE:
+            self.hold_against(file)
+            return
         if file.path.suffix.lower() == ".dbc":
             self.choice.dbc = file
         elif file.path.suffix.lower() == ".toml":
@@ -172,11 +182,48 @@ class Session:
         else:
             dbc = self.choice.dbc if is_framed(file.path) else None
             first = self.choice if self.choice.file is None else Choice()
-            self.choice = Choice(file=file, dbc=dbc, model=first.model, bench=first.bench, tables=self.tables)
+            self.choice = Choice(
+                file=file, dbc=dbc, model=first.model, bench=first.bench, tables=self.tables, system=self.choice.system
+            )
             self.offered, self.seen, self.draft, self.overlays = [], None, {}, []
         if self.choice.file is not None:
             self.read()
         self.touch("log")
+
+    def hold_against(self, model: LogFile | None) -> None:
+        """Hold logs against a model of the user's own; None: the vane chain. Before code runs, the user is asked."""
+        self.asked = None if model is None or self.runs(model) else model
+        if self.asked is None and model != self.choice.system:
+            c = self.choice
+            self.choice = Choice(file=c.file, dbc=c.dbc, tables=self.tables, system=model)  # names were the other's
+            self.offered, self.seen, self.draft, self.overlays = [], None, {}, []
+            if c.file is not None:
+                self.read()
+        self.touch("model", "log")
+
+    def runs(self, model: LogFile) -> bool:
+        """Whether a model's code may run: it came with the workbench, or the user has allowed what it says now."""
+        return model.shipped or _digest(model.path) in self.allowed
+
+    def allow(self) -> None:
+        """Let the code run that was asked about, as it stands."""
+        if (model := self.asked) is not None:
+            self.allowed.add(_digest(model.path))
+            self.hold_against(model)
+
+    def refuse(self) -> None:
+        """Leave the code that was asked about alone."""
+        self.asked = None
+        self.touch("model", "log")
+
+    def words(self) -> list[str]:
+        """The log, its options and its model, as the worker needs them. WorkError where the model's code is another
+        than was allowed.
+        """
+        model = self.choice.system
+        if model is not None and not self.runs(model):
+            raise WorkError(f"{model.name}: has changed since its code was allowed to run; choose it again")
+        return self.choice.words(real=True)
 
     def read(self) -> None:
         """Read the log as the form says, then compare it with the model."""
@@ -191,13 +238,13 @@ class Session:
         self.do("log", self._read())
 
     async def _read(self) -> None:
-        words = self.choice.words(real=True)
-        dbc = str(self.choice.dbc.path) if self.choice.dbc else None
-        self.offered = await self.search.call("offers", "opening the file", path=words[0], dbc=dbc)
+        words = self.words()
+        self.offered = await self.search.call("offers", "opening the file", words=words)
         self.seen = await self.search.call("look", "looking at its names", words=words)
         self.touch("log")
         self.preview = await self.search.call("preview", "reading the log", words=words)
-        self.moments = moments.of_log(self.preview["channels"], self.preview["faults"], self._marks())
+        if self.choice.system is None:
+            self.moments = moments.of_log(self.preview["channels"], self.preview["faults"], self._marks())
         self._draw_log()
         self.touch("log")
         if self.overlays:
@@ -207,7 +254,7 @@ class Session:
         if self.preview["channels"]:
             self.do("compare", self._compare())
         else:
-            wanted = ", ".join(UNITS)
+            wanted = ", ".join(self.seen["ours"])
             raise WorkError(f"{words[0]}: none of its names is a signal of ours ({wanted}); map them below")
 
     def _marks(self) -> list[Mark]:
@@ -220,7 +267,8 @@ class Session:
             return
         over = [Over(o.file.name, o.channels, o.later) for o in self.overlays if o.channels is not None]
         spans = moments.fault_bands(self.preview["faults"])
-        self.curves["log"] = of_log(self.preview["channels"], str(self.choice.file.path), over, self._marks(), spans)
+        key, modes = str(self.choice.file.path), self.choice.system is None
+        self.curves["log"] = of_log(self.preview["channels"], key, over, self._marks(), spans, modes)
 
     def lay_over(self, file: LogFile) -> None:
         """Draw another log over this one, read in the same way."""
@@ -242,6 +290,7 @@ class Session:
     async def _lay_over(self) -> None:
         for o in self.overlays:
             if o.channels is None:
+                self.words()
                 words = replace(self.choice, file=o.file).reading(real=True)
                 try:
                     o.channels = (await self.bench.call("over", "reading the other log", words=words))["channels"]
@@ -253,16 +302,17 @@ class Session:
                 self.touch("over")
 
     async def _compare(self) -> None:
-        words = self.choice.words(real=True)
+        words = self.words()
         self.compared = await self.search.call("compare", "comparing", words=words)
         worst = max(self.compared["figures"], key=lambda f: f.rms / f.noise_floor)
         self.show(worst.stage)
         self.touch("compare", "diagnosis")
-        self.do("loop", self._whole_loop(self.compared))
+        if self.choice.system is None:
+            self.do("loop", self._whole_loop(self.compared))
 
     async def _whole_loop(self, compared: dict[str, Any]) -> None:
         floors = {f.signal: f.noise_floor for f in compared["figures"]}
-        loop = await self.bench.call("whole_loop", "", words=self.choice.words(real=True), floors=floors)
+        loop = await self.bench.call("whole_loop", "", words=self.words(), floors=floors)
         if self.compared is compared:
             self.loop = loop
         self.touch("loop")
@@ -285,7 +335,7 @@ class Session:
         self.touch("sofar")
 
     async def _diagnose(self) -> None:
-        words = self.choice.words(real=True)
+        words = self.words()
         self.sofar = []
         self.touch("sofar")
         self.touch("diagnosis")
@@ -338,7 +388,7 @@ class Session:
                     await self._make(s.stage, effects, self.search)
 
     async def _make(self, stage: str, effects: tuple[str, ...], worker: Worker) -> None:
-        words = self.choice.words(real=True)
+        words = self.words()
         d = self.diagnosis
         text = f"fitting {' + '.join(effects) or 'the nominal model'}"
         answer = await worker.call(
@@ -417,7 +467,7 @@ class Session:
             if f is None or not self.hand:
                 return
             given = {"stage": stage, "theta": f.theta, "floor": f.floor, "values": self.values()}
-            answer = await self.bench.call("hand", "", words=self.choice.words(real=True), **given)
+            answer = await self.bench.call("hand", "", words=self.words(), **given)
             if self.hand and stage == self.stage and f is self.fitted():
                 self.hand_rms = answer["rms"]
                 self._draw(answer["curves"])
@@ -441,7 +491,7 @@ class Session:
     async def _recommend(self) -> None:
         assert self.diagnosis is not None
         self.touch("experiment")
-        given = {"words": self.choice.words(real=True), "diagnosis": self.diagnosis["diagnosis"]}
+        given = {"words": self.words(), "diagnosis": self.diagnosis["diagnosis"]}
         self.experiment = await self.search.call("experiment", "trying demand profiles", **given)
         self.experiment_done = True
         self.touch("experiment")
@@ -463,7 +513,7 @@ class Session:
         path = self.anew("report", "diagnosis.html")
         self.touch("save")
         await self.search.call(
-            "report", "writing the report", words=self.choice.words(real=True), diagnosis=self.diagnosis["diagnosis"],
+            "report", "writing the report", words=self.words(), diagnosis=self.diagnosis["diagnosis"],
             path=str(path),
             command=self.command("diagnose", "--report", "diagnosis.html"), next_experiment=self.experiment,
         )  # fmt: skip
@@ -485,7 +535,7 @@ class Session:
             self.do("save", self._save_model(["--effect", str(law)] if law else []))
 
     async def _save_model(self, law: list[str]) -> None:
-        words = ["extend", *self.choice.words(real=True), *law, *self.extend_words()]
+        words = ["extend", *self.words(), *law, *self.extend_words()]
         for name in ("extended.toml", "extended.html"):
             words[words.index(name)] = str(self.folder / name)
         files = {"model": self.anew("model", "extended.toml"), "extended": self.anew("extended", "extended.html")}
@@ -502,6 +552,7 @@ class Session:
     async def _save_mapping(self) -> None:
         path = self.anew("mapping", "mapping.toml")
         self.touch("mapping")
+        self.words()
         words = ["map", *self.choice.reading(real=True), "--out", str(path)]
         await self.bench.call("command", "writing the mapping file", words=words)
         if path.exists():
@@ -515,3 +566,11 @@ class Session:
                 w.stop()
         self._hand_wanted = False
         self.touch("jobs")
+
+
+def _digest(path: Path) -> str:
+    """What a file says, in short; "" where it cannot be read."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return ""

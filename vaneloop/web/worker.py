@@ -6,6 +6,7 @@ It calls what the command line calls.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import io
 import os
@@ -31,7 +32,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
 from vaneloop.base.signals import UNITS
 from vaneloop.cli import options
-from vaneloop.cli.chains import chain_of, tell_search
+from vaneloop.cli.chains import tell_search
 from vaneloop.cli.main import main
 from vaneloop.cli.schedule import log_of
 from vaneloop.design.links import ScheduleOptions
@@ -42,35 +43,34 @@ from vaneloop.fleet.folder import Folder
 from vaneloop.fleet.report import view_of
 from vaneloop.fleet.state import state_of
 from vaneloop.fleet.tables import answers, roll_up
+from vaneloop.identification import System
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.vane_chain.experiment import recommend
-from vaneloop.identification.workflow import extend_stage, locate_stages
-from vaneloop.pages.diagnosis import diagnosis_page, located_sentence, located_tone
+from vaneloop.identification.workflow import locate_stages
+from vaneloop.pages.diagnosis import diagnosis_page, located_tone
 from vaneloop.pages.fleet import fleet_page, log_page
 from vaneloop.pages.schedule import NAMES, schedule_page
 from vaneloop.pages.story import fall, word
-from vaneloop.verbs.learn import learned, with_path
+from vaneloop.verbs.learn import with_path
 from vaneloop.verbs.machine import Machine
-from vaneloop.verbs.search import Diagnosed, diagnosed
+from vaneloop.verbs.parts import read_record, signals_of
+from vaneloop.web.held import Held, held, system_of
 from vaneloop.web.process import Progress, answer, parsed
 
 __all__ = ["TASKS"]
 
 # ---- what is kept between questions ----------------------------------------------------------------------------------
 
-_CHAIN: dict[tuple[str, ...], Any] = {}  # of the latest log only
+_HELD: dict[tuple[str, ...], Held] = {}  # the latest log only
 
 
-def chain_for(words: list[str], progress: Progress) -> Any:
-    """Return the log that ``words`` name (with its options), as stages; read once."""
+def held_of(words: list[str], progress: Progress) -> Held:
+    """Return the log that ``words`` name (with its options), held against its model; read once."""
     key = tuple(words)
-    if key not in _CHAIN:
-        warm_up(lambda text: progress(None, text))
-        _CHAIN.clear()
-        progress(None, "reading the log")
-        tell_search(lambda text: progress(None, text))
-        _CHAIN[key] = chain_of(parsed("diagnose", words))
-    return _CHAIN[key]
+    if key not in _HELD:
+        _HELD.clear()
+        _HELD[key] = held(parsed("diagnose", words), lambda text: progress(None, text))
+    return _HELD[key]
 
 
 # ---- tasks -----------------------------------------------------------------------------------------------------------
@@ -88,23 +88,31 @@ def ready(progress: Progress) -> None:
     locate_stages(Machine().bind(log).stages)
 
 
-def offers(progress: Progress, path: str, dbc: str | None) -> list[str]:
-    """Names that the log offers, to be mapped."""
-    return offered(path, dbc=dbc)
+def offers(progress: Progress, words: list[str]) -> list[str]:
+    """Names that the log offers, to be mapped; none where the model has a reader of its own."""
+    args = parsed("diagnose", words)
+    return [] if (system := system_of(args)) and system.read else offered(args.log, dbc=args.dbc)
 
 
 def look(progress: Progress, words: list[str]) -> dict[str, Any]:
-    """What the form of names and units shows: the survey of the log, or why there is none."""
+    """What the form of names and units shows: the survey of the log, or why there is none.
+
+    ``ours``: the signals that the model looks for, name -> unit.
+    """
     args = parsed("diagnose", words)
+    system = system_of(args)
+    ours = UNITS if system is None else signals_of(system)
+    none = {"signals": {}, "open": {}, "unused": [], "suggested_rpm": None, "damaged": False, "ours": ours}
+    if system is not None and system.read is not None:
+        return none
     try:
-        seen = survey(args.log, **options.log_options(args))
+        seen = survey(args.log, **options.log_options(args), signals=ours)
     except NoTime as e:
-        open_ = {"t": str(e).partition(": ")[2]}
-        return {"signals": {}, "open": open_, "unused": [], "suggested_rpm": None, "damaged": False}
+        return {**none, "open": {"t": str(e).partition(": ")[2]}}
     rows = {r.signal: (r.name, r.unit, r.how, r.confidence, r.why, r.curve.tolist()) for r in seen.rows}
     return {
         "signals": rows, "open": seen.open, "unused": seen.unused(), "suggested_rpm": seen.suggested_rpm,
-        "damaged": seen.damaged,
+        "damaged": seen.damaged, "ours": ours,
     }  # fmt: skip
 
 
@@ -113,6 +121,8 @@ def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
     if is_framed(Path(words[0])):
         columns.warm_up(lambda text: progress(None, text))
     args = parsed("diagnose", words)
+    if (system := system_of(args)) is not None:
+        return _preview_of(args, system)
     named = {f"fault_{f}": f for f in FAULTS}  # as vgv.dbc calls them
     signals = {**UNITS, **dict.fromkeys(named, "-")}
     try:
@@ -124,23 +134,32 @@ def preview(progress: Progress, words: list[str]) -> dict[str, Any]:
     return {"notes": log.notes, "channels": {n: (UNITS[n], c.t, c.values) for n, c in own.items()}, "faults": faults}
 
 
+def _preview_of(args: argparse.Namespace, system: System) -> dict[str, Any]:
+    """`preview` for a model of the user's own: what it would be given of the log."""
+    record, notes = read_record(args.log, system, **({} if system.read else options.log_options(args)))
+    units, t, channels = signals_of(system), np.asarray(record.t, dtype=float), {}
+    for name, values in record.columns.items():
+        there = np.isfinite(values)
+        if there.any():
+            channels[name] = units.get(name, ""), t[there], np.asarray(values)[there]
+    return {"notes": notes, "channels": channels, "faults": {}}
+
+
 def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
     """Compare and locate: errors stage by stage, failure maps, curves."""
-    chain = chain_for(words, progress)
+    it = held_of(words, progress)
     progress(0.1, "comparing")
-    located = locate_stages(chain.stages, lambda share, name: progress(0.1 + 0.9 * share, f"locating: {name}"))
-    figures = [f for x in located for f in x.signals]
+    answer = it.compared(lambda share: progress(0.1 + 0.9 * share, "comparing"))
     curves = {
-        x.stage: curves_of(LeastSquaresProblem(chain.stage(x.stage), x.floor), {"nominal model": x.fit.theta})
-        for x in located
+        x.stage: curves_of(LeastSquaresProblem(it.stage(x.stage), x.floor), {"nominal model": x.fit.theta})
+        for x in answer.located
     }
     progress(1.0, "")
     return {
-        "figures": figures, "located": {x.stage: x for x in located},
-        "verdict": located_sentence(located, chain.not_observed),
-        "tone": located_tone(located),
-        "curves": curves, "not_observed": chain.not_observed, "notes": chain.notes,
-        "windows": {x.name: x.window for x in chain.stages},
+        "figures": [f for x in answer.located for f in x.signals], "located": {x.stage: x for x in answer.located},
+        "verdict": answer.sentence(), "tone": located_tone(answer.located), "curves": curves,
+        "not_observed": it.bound.not_observed, "notes": it.bound.notes,
+        "windows": {x.name: x.window for x in it.bound.stages},
     }  # fmt: skip
 
 
@@ -175,7 +194,7 @@ def curves_of(judge: Any, models: dict[str, Any]) -> dict[str, Any]:
 
 def diagnose(progress: Progress, words: list[str]) -> dict[str, Any]:
     """Search every stage for missing effects, as ``vaneloop diagnose`` does."""
-    chain = chain_for(words, progress)
+    it = held_of(words, progress)
     progress(0.0, "searching the library of effects")
 
     def news(n: Any) -> None:
@@ -186,14 +205,14 @@ def diagnose(progress: Progress, words: list[str]) -> dict[str, Any]:
             progress(None, {"found": said})
         progress(n.fraction, n.text)
 
-    answer = diagnosed(chain, words[0], 2, news=news)
+    answer = it.diagnosed(news)
     return {"diagnosis": answer.diagnosis, "json": answer.to_dict(), "verdict": answer.sentence()}
 
 
 def refit(progress: Progress, words: list[str], stage: str, effects: tuple[str, ...]) -> dict[str, Any]:
     """Fit one stage with exactly these effects, as ``vaneloop extend`` does."""
-    chain = chain_for(words, progress)
-    s = chain.stage(stage)
+    it = held_of(words, progress)
+    s = it.stage(stage)
     expected = max(2.0, 1.5 * len(effects) * (len(effects) + 1))
     done = 0
 
@@ -203,12 +222,15 @@ def refit(progress: Progress, words: list[str], stage: str, effects: tuple[str, 
         progress(min(0.97, done / expected), f"fitting {' + '.join(effects) or 'the nominal model'}")
 
     tick()
-    r = extend_stage(s, effects, tick)
+    r = it.extended(s, effects, tick)
     judge = LeastSquaresProblem(s, r.floor)
     models = {"nominal model": r.base.theta}
     if effects:
         models["with effects"] = r.final.theta
-    return {"result": r, "curves": curves_of(judge, models), "theta": r.final.theta, "floor": r.floor}
+    bounds = {e: {p.name: p for p in s.effect(e).parameters} for e in effects}
+    return {
+        "result": r, "curves": curves_of(judge, models), "theta": r.final.theta, "floor": r.floor, "bounds": bounds,
+    }  # fmt: skip
 
 
 def hand(
@@ -217,8 +239,7 @@ def hand(
     """Error with parameters set by hand: nothing is fitted. ``values``: effect -> parameter -> value in its declared
     unit.
     """
-    chain = chain_for(words, progress)
-    s = chain.stage(stage)
+    s = held_of(words, progress).stage(stage)
     judge = LeastSquaresProblem(s, np.asarray(floor))
     by_hand = np.array(theta, dtype=float)
     for effect, given in values.items():
@@ -233,26 +254,24 @@ def hand(
 
 def experiment(progress: Progress, words: list[str], diagnosis: Any) -> dict[str, Any] | None:
     """Recommend the next experiment, as ``vaneloop experiment`` does."""
-    chain = chain_for(words, progress)
-    return recommend(diagnosis, lambda f: progress(f, "trying demand profiles"), chain)
+    bound = held_of(words, progress).bound
+    return recommend(diagnosis, lambda f: progress(f, "trying demand profiles"), bound)
 
 
 def report(
     progress: Progress, words: list[str], diagnosis: Any, path: str, command: str, next_experiment: Any = None
 ) -> str:
     """Write the page of the diagnosis, as ``vaneloop diagnose --report`` does."""
-    chain = chain_for(words, progress)
+    it = held_of(words, progress)
     progress(None, "writing the page")
-    return str(diagnosis_page(diagnosis, chain, command, words[0], next_experiment).write(path))
+    by_log = it.again(diagnosis).by_log
+    return str(diagnosis_page(diagnosis, it.bound, command, words[0], next_experiment, by_log).write(path))
 
 
 def learn(progress: Progress, words: list[str], diagnosis: Any, law: str, page: str, command: str) -> dict[str, Any]:
     """Learn a law from a log that has been diagnosed, as ``vaneloop learn`` does; write its file and its page."""
-    chain = chain_for(words, progress)
-    found = Diagnosed(chain, diagnosis, words[0])
-    before = options.machine_of(parsed("diagnose", words)).added
     text = "trying every quantity at every place"
-    answer = learned(chain, words[0], before, progress=lambda f: progress(f, text), found=found)
+    answer = held_of(words, progress).learned(diagnosis, lambda f: progress(f, text))
     if answer.model is not None:
         answer = with_path(answer, law, command)
     answer.report(page, command)
