@@ -266,7 +266,7 @@ def test_an_experiment_draws_its_profile_and_a_replay_what_it_measured(log: vane
     diagnosed = Diagnosed(vaneloop.compare(log[["x_lvdt", "vigv"]]).bound, Diagnosis("none", [], {}, {}, 0.0), "run")
     best: Any = {
         "t": np.arange(3.0),
-        "n_dem": np.ones(3),
+        "inputs": {"n_dem": ("%", np.ones(3))},
         "text": "Run it.",
         "table": [{"profile": "p", "by_pair": []}],
     }

@@ -108,7 +108,7 @@ def tank(folder: Path, _: pytest.MonkeyPatch) -> None:
 def rivals(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An experiment's answer: to find rivals and try profiles takes half a minute."""
     t = np.arange(0.0, 60.0, 0.1)
-    told = {"t": t, "n_dem": t, "table": [], "separates": True}
+    told = {"t": t, "inputs": {"n_dem": ("%", t)}, "table": [], "heads": {}, "separates": True}
     page = Page("t", "v")
     answer = SimpleNamespace(recommended=told, to_dict=lambda: told, sentence=str, report=lambda p, _: page.write(p))
     monkeypatch.setattr("vaneloop.cli.experiment.diagnosed", lambda *_, **__: None)

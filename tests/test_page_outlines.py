@@ -38,6 +38,7 @@ from vaneloop.identification.unmodelled.fitted_candidate import Outcome as Learn
 from vaneloop.identification.unmodelled.learned_law import LearnedLaw
 from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
 from vaneloop.identification.user_models.by_log import ByLog, Logs
+from vaneloop.identification.vane_chain.experiment import HEADS
 from vaneloop.identification.workflow import Diagnosis
 from vaneloop.pages.by_log import curves_by_log, log_by_log
 from vaneloop.pages.campaign import CampaignView, GroupView, Requirement, campaign_page
@@ -389,8 +390,8 @@ def test_the_next_experiment() -> None:
         {"profile": "slams", "nats": -233.6, "spreads": 0.0, "repeats": 0},
     ]
     plan = {
-        "text": "Move slowly.\n\nThen fast.", "t": np.arange(20.0), "n_dem": 50.0 + np.arange(20.0) ** 1.2,
-        "separates": True, "table": table,
+        "text": "Move slowly.\n\nThen fast.", "t": np.arange(20.0), "separates": True,
+        "inputs": {"n_dem": ("%", 50.0 + np.arange(20.0) ** 1.2)}, "table": table, "heads": HEADS,
     }  # fmt: skip
     approve("experiment", outline(experiment_page(d, bound, "vaneloop experiment", "a.csv", "Move the vanes.", plan)))
     assert "next experiment" not in outline(experiment_page(d, bound, "", "a.csv", "None is needed.", None))

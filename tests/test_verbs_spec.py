@@ -747,7 +747,8 @@ def test_an_experiment_is_recommended_where_rivals_are_left() -> None:
     none = search.Experiment(diagnosed, None, "a.csv")
     assert none.sentence() == "Nothing to separate: the log leaves no rivals."
     assert none.to_dict() == {"schema": 1, "log": "a.csv", "recommended": None, "profiles": [], "notes": ["n"]}
-    e = {"score": 3.5, "profile": "p", "repeats": 2, "separates": ["x"], "text": "Run p.", "table": [1], "more": 0}
+    e = {"score": 3.5, "profile": "p", "repeats": 2, "separates": ["x"], "text": "Run p.", "table": [1],
+         "heads": {"nats": "nats"}, "more": 0}  # fmt: skip
     said = search.Experiment(diagnosed, e, "a.csv").to_dict()
     assert said["recommended"] == {"nats": 3.5, "profile": "p", "repeats": 2, "separates": ["x"], "text": "Run p."}
     assert said["profiles"] == [1] and (said["schema"], said["log"], said["notes"]) == (1, "a.csv", ["n"])
@@ -902,7 +903,7 @@ def test_verbs_tell_a_system_from_a_machine(monkeypatch: pytest.MonkeyPatch) -> 
     assert search.experiment("a.csv", machine).sentence() == "go" and asked[-1][2] is machine
     assert search.experiment("a.csv").log == "a.csv" and asked[-1][2] == Machine()
     bound = SimpleNamespace(fitted=SimpleNamespace(stages=["s"]), judged=lambda: "judged")
-    monkeypatch.setattr(search, "_logs", lambda *a: asked.append(("logs", *a)) or (bound, "r.csv"))
+    monkeypatch.setattr(search, "logs_for", lambda *a: asked.append(("logs", *a)) or (bound, "r.csv"))
     found = SimpleNamespace(stages=["first", "second"], notes=["old"])
     monkeypatch.setattr(search, "search", lambda *a: asked.append(("search", *a)) or found)
     by_log = SimpleNamespace(notes=["by log"])
@@ -912,7 +913,7 @@ def test_verbs_tell_a_system_from_a_machine(monkeypatch: pytest.MonkeyPatch) -> 
     own = system(without=["a"])
     said = search.diagnose("r.csv", own, without=["b"], progress=tell)  # type: ignore[arg-type]
     (_, log, of, *_), (_, *how), (_, *by) = asked[-3:]
-    assert log == "r.csv" and tuple(of.without) == ("a", "b") and how == [["s"], None, tell, 1, "judged"]
+    assert log == "r.csv" and tuple(of.without) == ("a", "b") and how == [["s"], None, tell, 1, "judged", None]
     assert by == [bound, "first", None] and said.diagnosis.notes == ["by log"] and said.by_log is by_log
     monkeypatch.setattr(search, "_extended", lambda *a: ("extended", *a))
     assert search.extend("r.csv", ["law"], own) == ("extended", bound, "r.csv", ["law"], None)

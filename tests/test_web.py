@@ -745,6 +745,7 @@ IN_ONE_TEST = ("locate", "replay", "extend", "diagnose", "experiment")  # the ot
 @needs_browser
 def test_every_report_is_open_to_phone_and_screen_reader(browser: Any, tmp_path: Path) -> None:
     import vaneloop
+    from vaneloop.identification.vane_chain.experiment import HEADS
     from vaneloop.pages.diagnosis import diagnosis_page, experiment_page
 
     log = ROOT / "examples" / "hidden_effect.parquet"
@@ -752,7 +753,14 @@ def test_every_report_is_open_to_phone_and_screen_reader(browser: Any, tmp_path:
     parts = extended.diagnosis, extended.bound, "vaneloop", str(log)
     t = np.arange(100.0)
     row = {"profile": "ramp", "nats": 30.0, "spreads": 4.0, "repeats": 1}
-    experiment = {"text": "Ramp it.", "t": t, "n_dem": t, "separates": True, "table": [row]}
+    experiment = {
+        "text": "Ramp it.",
+        "t": t,
+        "inputs": {"n_dem": ("%", t)},
+        "separates": True,
+        "table": [row],
+        "heads": HEADS,
+    }
     reports = {
         "locate": vaneloop.locate(log).page(),
         "replay": vaneloop.replay(vaneloop.read_log(log)).page(),

@@ -60,7 +60,7 @@ def asked(args: argparse.Namespace) -> bool:
                 raise InputError(f"--{name}{what} needs --system MY.py")
         return False
     for name in ("strategy", "tolerance", "tables", "out"):
-        model_file = name == "out" and (hasattr(args, "effect") or hasattr(args, "learns"))
+        model_file = name == "out" and any(hasattr(args, x) for x in ("effect", "learns", "limit"))
         if getattr(args, name, None) and not model_file:
             raise InputError(f"--{name} does not go with --system")
     return True

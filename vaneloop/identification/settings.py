@@ -1276,6 +1276,35 @@ AT_ONCE = setting(
 )
 
 # ---- Vane chain -----------------------------------------------------------------------------------------------------
+DESIGN_SAMPLES = setting(
+    4000,
+    "samples",
+    "A proposed run is simulated with so many samples at most.",
+    "numerics: a second for each run tried",
+)
+DESIGN_SIZES = setting(
+    (1.0, 0.7, 0.5, 0.3, 0.15),
+    "share",
+    "A run takes the first of these parts of its range with which its outputs keep their limits.",
+    "judgement: the larger the more it tells",
+)
+DESIGN_PARTS = setting(
+    24,
+    "parts",
+    "The best run is improved by shifting one of so many parts of it.",
+    "judgement: what a bench can follow",
+)
+DESIGN_SHIFTS = setting(
+    60, "runs", "So many shifts of a part are tried.", "judgement: each takes as long as a run of the bank"
+)
+DESIGN_GAIN = setting(1e-3, "log error", "A shift must tell so much more.", "numerics: less is rounding")
+DESIGN_PACE = setting(
+    0.618, "times", "Each further input goes through a run so much faster.", "numerics: no two inputs then go together"
+)
+DESIGN_CHECKS = setting(
+    4, "runs", "A proposed run is simulated with so many draws of noise.", "judgement: with either rival as the truth"
+)
+
 under("Vane chain")
 NEAR_STOP = setting(0.3, "mm", "A piston rests on its stop within this.", "judgement: a stop is known no better")
 SIMPLER = setting(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,8 @@ from vaneloop.pages.story import (
 from vaneloop.pages.style import TONE_OF, Tone, capital, interval, number
 
 __all__ = [
-    "compare_page", "diagnosis_page", "experiment_page", "extended_page", "located_sentence", "located_tone",
+    "compare_page", "diagnosis_page", "experiment_page", "experiment_panels",
+    "experiment_rows", "extended_page", "located_sentence", "located_tone",
     "verdict_sentence",
 ]  # fmt: skip
 
@@ -190,11 +191,12 @@ def extended_page(
 
 
 def experiment_page(
-    d: Diagnosis, bound: Bound, command: str, log: str, sentence: str, experiment: dict[str, Any] | None
-) -> Page:
+    d: Diagnosis, bound: Bound, command: str, log: str, sentence: str, experiment: dict[str, Any] | None,
+    by_log: ByLog | None = None,
+) -> Page:  # fmt: skip
     """The page of ``vaneloop experiment``: what to measure next, and the diagnosis that asks for it."""
     page = Page(f"Next experiment: {Path(log).name}", sentence, command=command, log=log)
-    return _told(page, d, bound, experiment, None, ())
+    return _told(page, d, bound, experiment, by_log, ())
 
 
 def diagnosis_page(
@@ -319,17 +321,27 @@ def _told(
 def _next(page: Page, experiment: dict[str, Any]) -> None:
     page.section("The next experiment", str(experiment["text"]))
     if experiment["separates"]:
-        page.plot(
-            overlay([Panel("rotor speed demand [%]", [Line("n_dem", experiment["t"], experiment["n_dem"], "target")])])
-        )
-    page.table(
-        ["profile", "log-likelihood ratio a run", "standard deviations", "runs needed"],
-        [
-            [r["profile"], r["nats"], r["spreads"], str(r["repeats"] or f"over {MOST_REPEATS}")]
-            for r in experiment["table"]
-        ],
-        digits=4,
-    )
+        page.plot(overlay(experiment_panels(experiment)))
+    page.table(list(experiment["heads"].values()), experiment_rows(experiment), digits=4)
+
+
+def experiment_panels(experiment: Mapping[str, Any]) -> list[Panel]:
+    """What drives the run that is recommended."""
+    return [
+        Panel(heading(name, unit), [Line(name, experiment["t"], values, "target")])
+        for name, (unit, values) in experiment["inputs"].items()
+    ]
+
+
+def experiment_rows(experiment: Mapping[str, Any]) -> list[list[Any]]:
+    """The runs that were tried, the best first, a row each."""
+
+    def cell(row: Mapping[str, Any], key: str) -> Any:
+        if key == "repeats":
+            return str(row[key] or f"over {MOST_REPEATS}")
+        return "leaves its limits" if row[key] is None else row[key]
+
+    return [[cell(row, key) for key in experiment["heads"]] for row in experiment["table"]]
 
 
 def _floors_anew(page: Page, d: Diagnosis, bound: Bound) -> None:

@@ -25,6 +25,8 @@ from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.regimes import Located
 from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance
 from vaneloop.identification.user_models.by_log import ByLog, as_given, bind
+from vaneloop.identification.user_models.experiment import Limits
+from vaneloop.identification.user_models.experiment import recommend as best_run
 from vaneloop.identification.vane_chain.candidates import SCALE, curve_effect, with_laws, without_laws
 from vaneloop.identification.vane_chain.experiment import recommend
 from vaneloop.identification.workflow import (
@@ -69,8 +71,8 @@ if TYPE_CHECKING:
     from vaneloop.verbs.replay import LogLike
 
 __all__ = [
-    "Diagnosed", "Experiment", "Extended", "Stages", "chain_for", "compare", "diagnose", "experiment", "extend",
-    "locate", "logs_for", "read_record",
+    "Diagnosed", "Experiment", "Extended", "Recommended", "Stages", "chain_for", "compare", "diagnose", "experiment",
+    "extend", "locate", "logs_for", "read_record",
 ]  # fmt: skip
 
 Progress = Callable[[float], None]
@@ -267,11 +269,13 @@ class Extended(Diagnosed):
 
 
 class Recommended(TypedDict):
-    """A demand profile that tells rivals apart.
+    """A run that tells rivals apart, or parameters.
 
-    score    smallest log-likelihood ratio over all pairs of rivals and all ``repeats``, nats
-    t, n_dem the profile, s and %
-    table    every profile that was tried, the best first
+    score      of a `Machine` the smallest log-likelihood ratio over all pairs of rivals and all ``repeats``, nats; of a
+               `System` the log of the error with the wrong law over that with the right one, or of its parameters'
+               standard errors in the log over those in the run
+    t, inputs  the run: s, and what drives the machine, name -> unit, values
+    table      every run that was tried, the best first; ``heads``: key -> heading of its columns
     """
 
     text: str
@@ -280,13 +284,16 @@ class Recommended(TypedDict):
     separates: bool
     repeats: int
     t: Array
-    n_dem: Array
+    inputs: dict[str, tuple[str, Array]]
     table: list[dict[str, object]]
+    heads: dict[str, str]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Experiment(Answer):
-    """Which demand profile would best tell the rivals of a diagnosis apart; ``recommended`` None: there are none."""
+    """Which run would best tell the rivals of a diagnosis apart; ``recommended`` None: there are none. Of a `System`
+    without rivals, which run would best tell its parameters.
+    """
 
     diagnosed: Diagnosed
     recommended: Recommended | None
@@ -301,8 +308,9 @@ class Experiment(Answer):
         e, notes = self.recommended, self.diagnosed.diagnosis.notes
         if e is None:
             return {"schema": 1, "log": self.log, "recommended": None, "profiles": [], "notes": notes}
+        score = "nats" if "nats" in e["heads"] else "score"
         best = {
-            "nats": e["score"], "profile": e["profile"], "repeats": e["repeats"], "separates": e["separates"],
+            score: e["score"], "profile": e["profile"], "repeats": e["repeats"], "separates": e["separates"],
             "text": e["text"],
         }  # fmt: skip
         return {"schema": 1, "log": self.log, "recommended": best, "profiles": e["table"], "notes": notes}
@@ -319,18 +327,25 @@ class Experiment(Answer):
         return self.diagnosed._curves
 
     def plot(self, ax: Axes | None = None, *, signal: str = "", residuals: bool = False) -> Axes:
-        """Draw the demand profile; where none is recommended, or a signal is asked for, as of a diagnosis."""
+        """Draw what drives the run; where none is recommended, or a signal is asked for, as of a diagnosis."""
         if self.recommended is None or signal or residuals:
             return super().plot(ax, signal=signal, residuals=residuals)
         ax = axes(ax)
-        ax.plot(self.recommended["t"], self.recommended["n_dem"], color=COLOUR["target"], label="n_dem")
-        return labelled(ax, heading("n_dem", "%"))
+        for name, (unit, values) in self.recommended["inputs"].items():
+            ax.plot(self.recommended["t"], values, color=COLOUR["target"], label=heading(name, unit))
+        return labelled(ax, ", ".join(heading(n, unit) for n, (unit, _) in self.recommended["inputs"].items()))
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
         d = self.diagnosed
         return experiment_page(
-            d.diagnosis, d.bound, command, self.log, self.sentence(), cast("dict[str, Any] | None", self.recommended)
+            d.diagnosis,
+            d.bound,
+            command,
+            self.log,
+            self.sentence(),
+            cast("dict[str, Any] | None", self.recommended),
+            d.by_log,
         )
 
 
@@ -736,16 +751,27 @@ def with_fits(model: Model, results: Sequence[StageDiagnosis]) -> Model:
 
 
 def experiment(
-    log: LogLike, model: Machine | Diagnosed | None = None, *, progress: Progress | None = None
+    log: LogsLike,
+    model: Machine | System | Diagnosed | None = None,
+    *,
+    fit: Parts = (),
+    test: Parts | LogsLike = (),
+    added: Model | None = None,
+    limits: Limits | None = None,
+    progress: Progress | None = None,
 ) -> Experiment:
-    """Which demand profile would best tell apart the rivals that a log leaves?
+    """Which run would best tell apart the rivals that a log leaves? Of a `System` without rivals: tell its parameters.
 
     Parameters
     ----------
     log : Log, pandas.DataFrame, str or Path
-        A log of the vane machine.
-    model : Machine or Diagnosed, optional
-        The machine, or the diagnosis of this log where that has been made.
+        As of `compare`.
+    model : Machine, System or Diagnosed, optional
+        The model, or the diagnosis of this log where that has been made.
+    fit, test, added
+        As of `compare`.
+    limits : Limits, optional
+        What a run of a `System` must keep to; default: the ranges that its inputs have in the log.
     progress : callable, optional
         Takes the fraction done.
 
@@ -761,8 +787,15 @@ def experiment(
     >>> print(vaneloop.experiment(frame))
     Nothing to separate: the log leaves no rivals.
     """
-    if not isinstance(model, Diagnosed):
-        chain, name = chain_for(log, model or Machine())
-        model = diagnosed(chain, name)
-    best = recommend(model.diagnosis, progress, model.bound)
+    tell = progress or (lambda _: None)
+    if isinstance(model, System):
+        model = diagnose(log, model, fit=fit, test=test, added=added, progress=lambda f: tell(0.3 * f))
+    elif not isinstance(model, Diagnosed):
+        model = diagnosed(*chain_for(cast("LogLike", log), model or Machine(), fit, test))
+    if model.by_log is None:
+        best = recommend(model.diagnosis, progress, model.bound)
+    else:
+        best = best_run(
+            model.by_log.logs.fitted, model.diagnosis.stages[0], limits or Limits(), lambda f: tell(0.3 + 0.7 * f)
+        )
     return Experiment(model, cast("Recommended | None", best), model.log)

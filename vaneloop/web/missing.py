@@ -12,9 +12,8 @@ from vaneloop.base.signals import heading
 from vaneloop.identification.candidates.library import LAWS
 from vaneloop.identification.regimes import Located
 from vaneloop.identification.settings import AGREES
+from vaneloop.pages.diagnosis import experiment_panels
 from vaneloop.pages.failures import failure_map, worst_cell
-from vaneloop.pages.figures import Line as PageLine
-from vaneloop.pages.figures import Panel as PagePanel
 from vaneloop.pages.figures import overlay, waterfall
 from vaneloop.pages.story import (
     CANNOT,
@@ -431,7 +430,7 @@ class _Page:
                 ask = ui.button("Recommend an experiment", icon="science", on_click=s.recommend).props(
                     "outline dense padding='4px 14px'"
                 )
-                open_question = lambda: bool(self._pairs()) and not s.experiment_done and not s.working["experiment"]  # noqa: E731
+                open_question = lambda: self._open() and not s.experiment_done and not s.working["experiment"]  # noqa: E731
                 live.shown(ask.classes("self-start"), open_question, "diagnosis", "experiment", "log", "jobs")
                 live.progress("experiment")
                 live.complaint("experiment")
@@ -466,11 +465,17 @@ class _Page:
         d = self.s.diagnosis
         return [] if d is None else [(f.effect, r) for x in d["diagnosis"].stages for f in x.effects for r in f.rivals]
 
+    def _open(self) -> bool:
+        """Whether a run could tell more: rivals, or the parameters of a model of the user's own."""
+        return bool(self._pairs()) or (self.s.diagnosis is not None and self.s.choice.system is not None)
+
     def _rivals(self) -> None:
         if self.s.diagnosis is None:
-            ui.label("If this log cannot distinguish rivals: the safe demand profile that can.").classes("soft small")
+            ui.label("If this log cannot distinguish rivals: the safe run that can.").classes("soft small")
         elif self._pairs():
             ui.label("Rivals: " + "; ".join(f"{a} or {b}" for a, b in self._pairs())).classes("small")
+        elif self._open():
+            ui.label("No rivals are left: a run can still tell the parameters better.").classes("soft small")
         else:
             ui.label("No rivals are left: this log needs no further experiment.").classes("soft small")
 
@@ -482,9 +487,8 @@ class _Page:
         if e is not None:
             ui.label(e["text"])
             if e["separates"]:
-                lines = [PageLine("n_dem", e["t"], e["n_dem"], "target")]
-                figure_of(overlay([PagePanel("n_dem [%]", lines)]), dark(s), height=230)
-        command_line(s.command("experiment", "--out", "next_demand.csv"))
+                figure_of(overlay(experiment_panels(e)), dark(s), height=230)
+        command_line(s.command("experiment", "--out", "next_run.csv" if s.choice.system else "next_demand.csv"))
 
     def _saved(self) -> None:
         s = self.s

@@ -13,7 +13,7 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -45,7 +45,6 @@ from vaneloop.fleet.state import state_of
 from vaneloop.fleet.tables import answers, roll_up
 from vaneloop.identification import System
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
-from vaneloop.identification.vane_chain.experiment import recommend
 from vaneloop.identification.workflow import locate_stages
 from vaneloop.pages.diagnosis import diagnosis_page, located_tone
 from vaneloop.pages.fleet import fleet_page, log_page
@@ -54,6 +53,7 @@ from vaneloop.pages.story import fall, word
 from vaneloop.verbs.learn import with_path
 from vaneloop.verbs.machine import Machine
 from vaneloop.verbs.parts import read_record, signals_of
+from vaneloop.verbs.search import experiment as recommend
 from vaneloop.web.held import Held, held, system_of
 from vaneloop.web.process import Progress, answer, parsed
 
@@ -254,8 +254,9 @@ def hand(
 
 def experiment(progress: Progress, words: list[str], diagnosis: Any) -> dict[str, Any] | None:
     """Recommend the next experiment, as ``vaneloop experiment`` does."""
-    bound = held_of(words, progress).bound
-    return recommend(diagnosis, lambda f: progress(f, "trying demand profiles"), bound)
+    found = held_of(words, progress).again(diagnosis)
+    answer = recommend(words[0], found, progress=lambda f: progress(f, "trying runs"))
+    return cast("dict[str, Any] | None", answer.recommended)
 
 
 def report(

@@ -28,7 +28,13 @@ if TYPE_CHECKING:
     from controller import Calibration
     from plant import Plant
 
-__all__ = ["divergence", "profiles", "recommend"]
+__all__ = ["HEADS", "divergence", "profiles", "recommend"]
+
+
+HEADS = {
+    "profile": "profile", "nats": "log-likelihood ratio a run", "spreads": "standard deviations",
+    "repeats": "runs needed",
+}  # fmt: skip
 
 
 def _piecewise(points: list[tuple[float, float]]) -> np.ndarray:
@@ -187,5 +193,5 @@ def recommend(d: Any, progress: Any = None, chain: Any = None) -> dict[str, Any]
         )
     return {
         "text": text, "profile": best["profile"], "score": gained, "separates": separated, "repeats": repeats,
-        "t": np.arange(len(profile)) * 0.01, "n_dem": profile, "table": table,
+        "t": np.arange(len(profile)) * 0.01, "inputs": {"n_dem": ("%", profile)}, "table": table, "heads": HEADS,
     }  # fmt: skip
