@@ -75,7 +75,7 @@ bench: $(READY_BENCH)  ## measure speed against C, python-control and pathsim
 	@$(need_gcc)
 	@$(PY) -m benchmarks
 
-pictures: $(READY_ALL)  ## take the pictures of the README, the tutorial and the workbench anew (docs/pictures)
+pictures: $(READY_ALL)  ## take every picture of the README and of docs anew (docs/pictures)
 	@$(need_chromium)
 	@$(PY) -m benchmarks.pictures
 

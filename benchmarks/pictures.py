@@ -4,6 +4,7 @@ write, and pages of the workbench. Beside the pictures lies what their bars say 
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shlex
@@ -20,6 +21,7 @@ from vaneloop.base.files import write
 
 __all__ = ["FIGURES", "REPORTS", "take"]
 
+PUBLISHED = (".mat", ".json", ".csv")  # logs of others, which the reports of the worked examples are made of
 FIGURES = "figures.json"  # picture -> the words on its bars, from left to right
 EXAMPLE = "examples/hidden_effect.parquet"
 # command that writes a page -> picture -> its figures, by a caption's words or their number on the page
@@ -29,6 +31,19 @@ REPORTS: dict[str, dict[str, tuple[str | int, ...]]] = {
     },
     f"extend {EXAMPLE} --effect valve_dead_band --effect aero_load --out extended.toml": {
         "tutorial_falls": ("How the error falls",),
+    },
+    "clearance": {"clearance": (0, 2)},
+    "diagnose DATA_EMPS.mat --test DATA_EMPS_PULSES.mat --system examples/emps.py": {
+        "emps_force": ("DATA_EMPS.mat (fitted)",), "emps_falls": ("How the error falls",),
+    },
+    "diagnose 0.5Hz36lbtension1amplitude.json --system examples/friction_damper.py --test "
+    "0.25Hz36lbtension1amplitude.json 1Hz36lbtension1amplitude.json 2Hz36lbtension0.5amplitude.json KocaeliDBE.json": {
+        "damper_loops": ("1Hz36lbtension1amplitude.json: force over displacement",),
+        "damper_where": ("Short bars help",),
+    },
+    "diagnose ex_1.csv --also ex_9.csv ex_20.csv ex_21.csv ex_23.csv ex_24.csv --test ex_4.csv ex_22.csv "
+    "--system examples/micro_gas_turbine.py": {
+        "turbine_power": ("ex_4.csv (test)",), "turbine_where": ("Short bars help",),
     },
 }  # fmt: skip
 
@@ -43,6 +58,17 @@ def missing(page: Any) -> None:
     page.locator(".fell").wait_for()
     page.wait_for_timeout(3000)
     page.locator(".vcard", has_text="What is missing?").evaluate("(e) => window.scrollTo(0, e.offsetTop - 8)")
+
+
+def own(page: Any) -> None:
+    """The same for a model of one's own."""
+    page.locator(".choose-model").click()
+    page.get_by_role("option", name="tank.py").last.click()
+    page.locator(".choose").click()
+    page.get_by_role("option", name="tank.csv").click()
+    page.get_by_role("button", name="Find the missing physics").click()
+    page.locator(".fell").wait_for()
+    page.wait_for_timeout(3000)
 
 
 def schedule(page: Any) -> None:
@@ -84,6 +110,7 @@ def fleet(page: Any) -> None:
 
 WORK = (
     ("", "missing", missing),
+    ("", "own", own),
     ("schedule", "schedule", schedule),
     ("run", "run", run),
     ("run", "calibrate", calibrate),
@@ -105,12 +132,19 @@ def _reports(folder: Path) -> list[Path]:
     from playwright.sync_api import sync_playwright
 
     out, said = [], {}
+    file = folder / FIGURES
+    before = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     with tempfile.TemporaryDirectory() as own, sync_playwright() as p:
         browser = p.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
         page = browser.new_page(viewport=WIDE, color_scheme="light", reduced_motion="reduce")
         page.set_default_timeout(PATIENCE)
         for line, pictures in REPORTS.items():
             words = [str(ROOT / w) if w.startswith("examples/") else w for w in shlex.split(line)]
+            missing_logs = [w for w in words if w.endswith(PUBLISHED) and not _brought(w, Path(own))]
+            if missing_logs:
+                print(f"no picture of {', '.join(pictures)}: {', '.join(missing_logs)} not found below {_data()}")
+                said |= {f"{name}.png": before[f"{name}.png"] for name in pictures if f"{name}.png" in before}
+                continue
             words = [sys.executable, "-m", "vaneloop", *words, "--quiet", "--report", f"{own}/page.html"]
             done = subprocess.run(words, cwd=own, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False)
             if done.returncode not in (0, 1):
@@ -119,9 +153,12 @@ def _reports(folder: Path) -> list[Path]:
             page.wait_for_function(DRAWN)
             for name, captions in pictures.items():
                 all_figures = page.locator("figure")
-                figures = [
+                found = [
                     all_figures.nth(c) if isinstance(c, int) else all_figures.filter(has_text=c).first for c in captions
                 ]
+                figures = [f.element_handle() for f in found]
+                for one, other in itertools.pairwise(figures):
+                    one.evaluate("(a, b) => a.after(b)", other)
                 figures[0].scroll_into_view_if_needed()
                 boxes = [f.bounding_box() for f in figures]
                 top, left = page.evaluate("[scrollY, scrollX]")
@@ -132,13 +169,31 @@ def _reports(folder: Path) -> list[Path]:
                 }  # fmt: skip
                 out.append(folder / f"{name}.png")
                 page.screenshot(path=str(out[-1]), full_page=True, clip=clip)
-                bars = [t for f in figures for t in f.locator(".bartext, .annotation-text").all_text_contents() if t]
-                names = [t for f in figures for t in f.locator(".xtick text").all_text_contents()]
+                bars = [t for f in figures for t in _texts(f, ".bartext, .annotation-text") if t]
+                names = [t for f in figures for t in _texts(f, ".xtick text")]
                 if bars:
                     said[out[-1].name] = {"bars": bars, "axis": names}
         browser.close()
-    out.append(write(folder / FIGURES, json.dumps(said, indent=1, ensure_ascii=False) + "\n"))
+    out.append(write(file, json.dumps(said, indent=1, ensure_ascii=False) + "\n"))
     return out
+
+
+def _texts(figure: Any, what: str) -> list[str]:
+    return [e.text_content() or "" for e in figure.query_selector_all(what)]
+
+
+def _data() -> Path:
+    """Folder of the published logs: VANELOOP_DATA, or shared/data beside the checkout."""
+    named = os.environ.get("VANELOOP_DATA")
+    return Path(named) if named else ROOT.parent / "shared" / "data"
+
+
+def _brought(name: str, folder: Path) -> bool:
+    """Whether a published log is found, by its name or behind its folders' names, and is now in ``folder``."""
+    found = next((f for f in _data().rglob(f"*{name}") if f.name == name or f.name.endswith(f"__{name}")), None)
+    if found is not None and not (folder / name).exists():
+        (folder / name).symlink_to(found.resolve())
+    return found is not None
 
 
 DRAWN = "[...document.querySelectorAll('.plot')].every((p) => p.querySelector('.main-svg'))"

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.pictures import REPORTS, WORK
 from hil.logs import Channel, read_log, write_log
 from tests.conftest import ROOT
 from tests.quotes import absent, lines_of, tokens
@@ -256,6 +257,41 @@ def test_the_first_picture_shows_the_figures_that_the_command_prints() -> None:
     shown = json.loads((ROOT / "docs" / "pictures" / "figures.json").read_text(encoding="utf-8"))["tutorial_falls.png"]
     said = [f"{name} {bar}" for name, bar in zip(shown["axis"], shown["bars"], strict=True)]
     assert " -> ".join(said) == printed[1]
+
+
+def test_one_command_takes_every_picture_and_its_reports_are_commands_of_the_pages() -> None:
+    """`make pictures`: a picture that nobody takes, or no page shows, would grow old."""
+    shown = {p.name for p in (ROOT / "docs" / "pictures").glob("*.png")}
+    taken = {f"{name}.png" for of in REPORTS.values() for name in of} | {f"web_{name}.png" for _, name, _ in WORK}
+    assert shown == taken
+    text = "\n".join((ROOT / page).read_text(encoding="utf-8") for page in PAGES)
+    assert [name for name in shown if f"pictures/{name}" not in text] == []
+    commands = [" ".join(shlex.split(s.text)) for steps in ALL.values() for s in steps if s.kind == "command"]
+    for line in REPORTS:
+        words = set(line.split())
+        assert any(words <= set(c.split()) for c in commands), line
+
+
+def test_the_figures_of_the_worked_examples_are_those_of_their_pictures() -> None:
+    """What the pages quote of published logs stands on the bars that `make pictures` took from the commands' pages."""
+    said = json.loads((ROOT / "docs" / "pictures" / "figures.json").read_text(encoding="utf-8"))
+    pages = ("examples_emps", "examples_friction_damper", "examples_micro_gas_turbine", "hysteresis_origin")
+    text = {name: (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8") for name in pages}
+    emps = said["emps_falls.png"]["bars"]
+    assert f"falls from {emps[0]} to {emps[-2]} noise floors" in text["examples_emps"]
+    damper, logs = said["damper_where.png"]["bars"], len(said["damper_where.png"]["axis"])
+    gap_at_2_hz, asymmetry_in_the_earthquake = float(damper[logs + 3]), float(damper[3 * logs - 1])
+    assert f"without it: {gap_at_2_hz:.2f})" in " ".join(text["examples_friction_damper"].split())
+    assert f"earthquake* ({asymmetry_in_the_earthquake:.2f})" in " ".join(text["examples_friction_damper"].split())
+    rows = re.findall(r"^\| ex_(?:4|22) \(test\) \| (\d+) W \| (\d+) W \|$", text["examples_micro_gas_turbine"], re.M)
+    assert [round(float(b), 2) for b in said["turbine_where.png"]["bars"][6:8]] == [
+        pytest.approx(float(after) / float(before), abs=0.006) for before, after in rows
+    ]
+    rings = re.search(r"ring across its links\*\* .*\| \*\*([\d.]+)\*\* \| \*\*([\d.]+)\*\* \| \*\*([\d.]+)\*\* \|",
+                      text["hysteresis_origin"])  # fmt: skip
+    assert rings
+    bars = [float(b) for b in said["clearance.png"]["bars"]]
+    assert [float(v) for v in rings.groups()] == pytest.approx(bars[4::6], abs=0.006)
 
 
 def test_the_pages_hold_what_this_test_is_for() -> None:

@@ -90,7 +90,7 @@ def command(args: argparse.Namespace) -> int:
 def _write(path: Path, e: Recommended) -> None:
     """Write what drives a run as a log: of the vane chain in any format, of a user's own system as a table."""
     if set(e["inputs"]) == {"n_dem"}:
-        write_log(path, {name: Channel(e["t"], v, unit) for name, (unit, v) in e["inputs"].items()})
+        write_log(path, {name: Channel(e["t"], v) for name, (_, v) in e["inputs"].items()})
         return
     if path.suffix.lower() != ".csv":
         raise InputError(f"--out {path}: must end with .csv, with --system")

@@ -102,7 +102,14 @@ def look(progress: Progress, words: list[str]) -> dict[str, Any]:
     args = parsed("diagnose", words)
     system = system_of(args)
     ours = UNITS if system is None else signals_of(system)
-    none = {"signals": {}, "open": {}, "unused": [], "suggested_rpm": None, "damaged": False, "ours": ours}
+    none: dict[str, Any] = {
+        "signals": {},
+        "open": {},
+        "unused": [],
+        "suggested_rpm": None,
+        "damaged": False,
+        "ours": ours,
+    }
     if system is not None and system.read is not None:
         return none
     try:

@@ -330,9 +330,8 @@ def recommend(
 ) -> dict[str, Any]:
     """The best run for the rivals of a diagnosis, or else for the parameters; as `vane_chain.experiment.recommend`."""
     bench = _Bench(bound, limits)
-    judged: _Rivals | _Parameters = _Rivals(bench, d)
-    if not judged.pairs:
-        judged = _Parameters(bench, d)
+    rivals = _Rivals(bench, d)
+    judged: _Rivals | _Parameters = rivals if rivals.pairs else _Parameters(bench, d)
     tell = progress or (lambda _: None)
     tried: list[tuple[str, list[tuple[float, Run]]]] = [
         (name, [(size, bench.of_shape(shape, size)) for size in DESIGN_SIZES]) for name, shape in SHAPES.items()
