@@ -132,3 +132,28 @@ def test_the_command_writes_the_run_as_a_log(tmp_path: Path, capsys: pytest.Capt
     run = vaneloop.read_log(out, signals={"pump": "V"}, require=["pump"])["pump"]
     assert run.values.min() >= 0.2 and run.values.max() <= 7.9 and np.abs(np.diff(run.values)).max() <= 4.0 + 1e-6
     assert "The next experiment" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_a_windowed_model_s_run_is_what_the_machine_would_do() -> None:
+    """The log restarts the model each two seconds; a proposed run is one free course of the same equation."""
+    t = np.arange(0.0, 20.0, 0.01)
+    rng = np.random.default_rng(0)
+    u, w = np.repeat(rng.uniform(0.0, 5.0, 40), 50), np.zeros(len(t))
+    for k in range(1, len(t)):
+        w[k] = w[k - 1] + 0.01 * (0.8 * u[k - 1] - 0.6 * w[k - 1])
+    system = System(
+        "rotor", "simulate", lambda x, u, p: p.a * u.u - p.c * x.w, inputs={"u": "V"}, states={"w": "rad/s"},
+        outputs={"w": "rad/s"}, window=2.0, parameters=[unknown(n, 1.0, "-") for n in "ac"], places=["w"],
+    )  # fmt: skip
+    bound = bind(system, [Record("run", t, {"u": u, "w": w})]).fitted
+    bench = _Bench(bound, Limits())
+    run = bench.of_shape(SHAPES["stairs up and down with dwells"], 1.0)
+    on = bench.simulated(run, bound.stage.neutral(), np.ones(1), 0)
+    assert on is not None
+    a, c = bound.stage.neutral()[:2]
+    decay = np.exp(-c * bench.t[1])
+    exact = np.zeros(len(bench.t))  # of a held input, step by step in closed form
+    for k in range(1, len(exact)):
+        exact[k] = decay * exact[k - 1] + (1.0 - decay) * a / c * run["u"][k - 1]
+    assert np.abs(on.measured[0] - exact).max() < 1e-3 * exact.max()

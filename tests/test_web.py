@@ -706,6 +706,8 @@ def test_a_model_of_one_s_own_from_its_file_to_the_error_at_the_noise(
     wait_ratio(page, "> 50")
     page.keyboard.press(" ")
     wait_ratio(page, "< 1.1")
+    page.get_by_role("button", name="Recommend an experiment").click()
+    page.get_by_text("No rivals are left. For the parameters").wait_for()
     looks(page, "own_model")
     page.get_by_role("button", name="Extended model").click()
     page.get_by_role("button", name="Go on with this model").click()

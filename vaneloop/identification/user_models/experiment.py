@@ -13,7 +13,7 @@ noise.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -126,13 +126,23 @@ class _Bench:
         own = {n: (float(np.min(log.columns[n])), float(np.max(log.columns[n]))) for n in self.sets if n in log.columns}
         self.ranges = {n: self.limits.ranges.get(n, own.get(n, (-1.0, 1.0))) for n in self.sets}
         self.first = {o: _first(log.columns[o]) if o in log.columns else 0.0 for o in outputs}
+        # what a machine does is one free run, where its model is held against a log window by window, too
+        begin: dict[str, float | str] = {
+            x: self.system.start.get(x, self.first.get(x, 0.0)) for x in self.system.states
+        }
+        self.free = replace(self.system, window=None, start=begin) if self.system.window else self.system
         again = np.linspace(log.t[0], log.t[-1], len(self.t))
+        self.usual = {o: _again(log.columns[o], log.t, again) if o in log.columns else 0.0 * again for o in outputs}
         self.log_again = {n: self._within(n, np.interp(again, log.t, log.columns[n])) for n in own}
 
     def _within(self, name: str, values: Array) -> Array:
         """A course of a channel brought within its range and rate."""
         low, high = self.ranges[name]
         out = np.clip(values, low, high)
+        if (cutoff := self.bound.data.motion_cutoff) and name in (self.system.position, self.system.velocity):
+            weights = np.hanning(2 * max(1, round(1.0 / (cutoff * float(self.t[1])))) + 3)
+            padded = np.pad(out, len(weights) // 2, mode="edge")  # an average leaves range and rate as they are
+            out = np.convolve(padded, weights / weights.sum(), mode="valid")
         most = self.limits.rates.get(name, np.inf) * float(self.t[1])
         if np.isfinite(most):
             for k in range(1, len(out)):
@@ -167,9 +177,8 @@ class _Bench:
         s = self.system
         if s.kind == "force" and s.position and s.velocity:
             columns[s.velocity] = np.gradient(run[s.position], self.t)
-        flat = {o: np.full(len(self.t), v) for o, v in self.first.items()}
         try:
-            empty = BoundSystem(s, [Record("run", self.t, columns | flat)], like=self.bound)
+            empty = BoundSystem(self.free, [Record("run", self.t, columns | self.usual)], like=self.bound)
             y = empty.run(self.theta_on(empty, theta)[None])[0]
         except StageError:
             return None
@@ -186,6 +195,12 @@ class _Bench:
         """Parameters of the log's stage as those of a run's: it starts as the first log does."""
         n, mine, theirs = len(self.system.parameters), len(on.runner.free_starts), len(self.bound.runner.free_starts)
         return np.concatenate([theta[:n], theta[n : n + mine], theta[n + theirs :]])
+
+
+def _again(values: Array, t: Array, again: Array) -> Array:
+    """An output of the log as a run may have it before it is simulated: its size says what is far out of bounds."""
+    there = np.isfinite(values)
+    return np.interp(again, t[there], values[there]) if there.any() else np.zeros(len(again))
 
 
 def _first(values: Array) -> float:
@@ -229,12 +244,14 @@ class _Rivals:
                 if on is None:
                     return None
                 judge = _problem(on, self.left)
-                error = float(judge.fit((*beside, wrong), self.bench.theta_on(on, start), 12).cost.sum())
+                right_theta = self.bench.theta_on(on, truth)
+                error = float(judge.fit((*beside, wrong), self.bench.theta_on(on, start), 12).cost.sum()) / judge.n
                 if draw:
-                    least = float(judge.fit((*beside, right), self.bench.theta_on(on, truth), 12).cost.sum())
+                    least = float(judge.fit((*beside, right), right_theta, 12).cost.sum()) / judge.n
                     out.append(0.5 * float(np.log(error / least)))
-                else:
-                    out.append(0.5 * float(np.log1p(error / judge.n)))
+                else:  # what is left of a run without noise is of filters and steps of the time, with either law
+                    least = float(np.sum(judge.errors(right_theta[None]) ** 2)) / judge.n
+                    out.append(0.5 * float(np.log((1.0 + error) / (1.0 + least))))
         return [min(out[k : k + 2]) for k in range(0, len(out), 2)]
 
     def row(self, score: float) -> float:
