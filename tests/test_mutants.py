@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import signal
 import subprocess
@@ -139,6 +140,21 @@ def test_every_file_of_the_product_belongs_to_a_target_and_its_tests_are_there()
     assert not [f for f in left if not f.endswith(("__init__.py", "__main__.py")) or "def " in (ROOT / f).read_text()]
     assert not [t for target in TARGETS for t in target.tests if not (ROOT / t.split("::")[0]).is_file()]
     assert {t.enough for t in TARGETS} == {ENOUGH, STRICT}
+
+
+def test_what_a_module_makes_of_a_class_is_made_anew_with_a_field_s_other_default(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "made.py").write_text(
+        "from dataclasses import dataclass\n\n@dataclass\nclass Range:\n    low: float = -1.0\n    high: float = 2.0\n"
+        "\nUSUAL = Range()\nHIGH = Range(high=9.0)\nBOTH = (USUAL, HIGH)\n"
+    )
+    monkeypatch.setattr(trial, "ROOT", tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    made: Any = importlib.import_module("made")
+    (m,) = (m for m in mutants_of(tmp_path, "made.py") if m.becomes == "low: float = 1.0")
+    trial._put(made, m.kind, m.where, m.names, m.code())
+    assert [(r.low, r.high) for r in (made.Range(), *made.BOTH)] == [(1.0, 2.0), (1.0, 2.0), (1.0, 9.0)]
 
 
 SCRIPT = """

@@ -75,6 +75,112 @@ def test_against_an_unknown_noise_the_rules_are_the_three_conditions(
     assert all(rule.verdict(c).holds for rule in rules.UNKNOWN_NOISE) == expected
 
 
+@given(before=LEVELS, after=LEVELS, correlation=st.floats(1.0, 6.0), form=st.floats(0.0, 3.0))
+@settings_of(max_examples=examples(40), deadline=None)
+def test_each_rule_of_two_fits_measures_what_it_names_in_its_unit(
+    before: list[float], after: list[float], correlation: float, form: float
+) -> None:
+    c = replace(comparison(before, after, form), correlation=correlation)
+    v = {r.name: r.verdict(c) for r in (*rules.KNOWN_NOISE, *rules.UNKNOWN_NOISE)}
+    a, b = np.array(before), np.array(after)
+    each, n = 50.0, 50.0 * BLOCKS
+    beyond = each * a.sum() - n
+    assert all(r.applies(c) for r in (*rules.KNOWN_NOISE, *rules.UNKNOWN_NOISE, rules.AWAY))
+    assert v["share of the excess"].value == pytest.approx(each * (a - b).sum() / beyond if beyond > 0.0 else np.inf)
+    assert v["log-likelihood gain"].value == pytest.approx(0.5 * each * (a - b).sum() / correlation)
+    assert v["log-likelihood gain"].limit == settings.NATS  # of the second parameter on, one more each
+    more = replace(c, after=replace(c.after, free=np.arange(6)))
+    assert more.further == 3 and rules.GAIN.verdict(more).limit == settings.NATS + 3.0
+    whole = (np.sqrt(a.mean()) - np.sqrt(b.mean())) * np.sqrt(2.0 * n / correlation)
+    local = np.sort((np.sqrt(a) - np.sqrt(b)) * np.sqrt(2.0 * each / correlation))[-2:].mean()
+    expected = max(whole, local * settings.SPREADS / settings.BLOCK_SPREADS)
+    assert v["fall of the error"].value == pytest.approx(expected, abs=1e-9)
+    a, b = np.maximum(a, 1.0), np.maximum(b, 1.0)  # where nobody knows the noise, no block counts for less than its own
+    assert v["share of the error"].value == pytest.approx(1.0 - b.sum() / a.sum(), abs=1e-12)
+    least = max(settings.LEAST_FALL * (a.sum() - BLOCKS), settings.LEAST_OF_NOISE * BLOCKS, form**2 * BLOCKS)
+    assert v["share of the error"].limit == pytest.approx(least / a.sum())
+    flat = max(1.0, settings.FLAT**2 * np.mean(before))
+    r = np.log(np.maximum(before, flat) / np.maximum(after, flat))
+    helps = np.maximum(r, 0.0).sum() / np.abs(r).sum() if np.abs(r).sum() > 0.0 else 0.0
+    assert v["share improved"].value == pytest.approx(helps)
+    assert v["blocks that improve"].value == np.sum(r > settings.AGREE)
+
+
+@given(
+    value=st.floats(-5.0, 5.0), neutral=st.floats(-1.0, 1.0), low=st.floats(0.01, 3.0), high=st.floats(0.01, 3.0),
+    others=st.floats(-5.0, 5.0),
+)  # fmt: skip
+@settings_of(max_examples=examples(40), deadline=None)
+def test_a_size_is_away_from_neutral_by_the_near_half_of_its_interval(
+    value: float, neutral: float, low: float, high: float, others: float
+) -> None:
+    shape = Parameter("shape", 0.0, "1", -9.0, 9.0, shape=True)
+    sizes = (shape, Parameter("size", neutral, "1", -9.0, 9.0))
+    stage: Any = SimpleNamespace(
+        index=lambda: {"known": slice(1, 2), "new": slice(2, 4)}, effect=lambda _: SimpleNamespace(parameters=sizes)
+    )
+    theta = np.array([1.0, 0.0, others, value])
+    c = comparison([9.0] * BLOCKS, [1.0] * BLOCKS)
+    after = replace(
+        c.after, effects=("known", "new"), theta=theta, free=np.array([0, 1, 2, 3]),
+        low=theta - np.array([0.1, 0.1, 5.0, low]), high=theta + np.array([0.1, 0.1, 5.0, high]),
+    )  # fmt: skip
+    judge: Any = SimpleNamespace(stage=stage, **vars(c.judge))
+    away = rules.AWAY.verdict(replace(c, judge=judge, before=replace(c.before, effects=("known",)), after=after))
+    near = low if neutral < value else high
+    assert away.value == pytest.approx(abs(value - neutral) / near, rel=1e-6)
+    if abs(abs(value - neutral) - near) > 1e-9:
+        assert away.holds == (not value - low <= neutral <= value + high)
+
+
+@given(before=st.lists(st.floats(0.0, 9.0), min_size=3, max_size=3), lost=st.integers(0, 3))
+@settings_of(max_examples=examples(25), deadline=None)
+def test_of_all_rows_each_unfitted_log_and_the_whole_must_show_the_gain(before: list[float], lost: int) -> None:
+    n = 40
+    rows = {log: np.full(n, rms) for log, rms in zip("fgh", before, strict=True)}
+    after = {log: np.full(n, 1.0) for log in "fgh"}
+    for of in (rows, after):
+        of["g"][:lost] = np.nan
+    r = rules.AllRows(rows, after, frozenset("gh"))
+    counts = {"f": n, "g": n - lost, "h": n}
+    gains = {log: 0.5 * counts[log] * (rms**2 - 1.0) for log, rms in zip("fgh", before, strict=True)}
+    least, worst = min((gains[log], log) for log in "gh")
+    assert r.least_gain[0] == pytest.approx(least) and gains[r.least_gain[1]] == pytest.approx(least)
+    total = sum(counts.values())
+    fall = (np.sqrt(sum(counts[k] * v * v for k, v in zip("fgh", before, strict=True)) / total) - 1.0) * np.sqrt(
+        2.0 * total
+    )
+    assert r.fall == pytest.approx(fall, abs=1e-9)
+    said = f"{r.least_gain[1]}: log-likelihood gain of {least:.1f} only"
+    if abs(least - settings.NATS) > 1e-6 and abs(fall - settings.SPREADS) > 1e-6:
+        if least >= settings.NATS:
+            said = "" if fall > settings.SPREADS else f"the error falls by {fall:.1f} standard deviations"
+        assert r.objection().startswith(said) and bool(r.objection()) == bool(said)
+    fitted = replace(r, tests=frozenset())  # where every log was fitted, none of them is asked by itself
+    assert not rules.UNFITTED_ROWS.applies(fitted) and fitted.least_gain[0] == np.inf
+
+
+@given(before=st.floats(1.1, 50.0), after=st.floats(0.9, 50.0), worst=st.floats(0.9, 50.0), effects=st.integers(0, 4))
+@settings_of(max_examples=examples(40), deadline=None)
+def test_what_a_set_leaves_is_measured_in_squares_beyond_the_noise(
+    before: float, after: float, worst: float, effects: int
+) -> None:
+    r = Remainder(before, after, worst, effects, 10_000)
+    known = before**2 - (1.0 + settings.FLOOR_KNOWN) ** 2
+    assert rules.EXPLAINS_HALF.verdict(r).value == pytest.approx((before**2 - after**2) / known)
+    assert rules.EXPLAINS_HALF.applies(r) == (effects > 0)
+    left, output = (rule.verdict(r) for rule in rules.LEAVES_LITTLE)
+    assert left.value == pytest.approx(after**2 - 1.0)
+    assert left.limit == pytest.approx(settings.LEAST_SHARE * (before**2 - 1.0))
+    assert output.value == max(after, worst)
+    assert output.limit == pytest.approx(1.0 + (settings.LEFT_FLOORS - 1.0) / max(effects, 1))
+    assert all(rule.applies(r) == (after > max(settings.TOLERATED, 1.0 + 3.0 / np.sqrt(2.0 * 10_000))) for rule in
+               rules.LEAVES_LITTLE)  # fmt: skip
+    quarter = rules.LEAVES_A_QUARTER.verdict(r)
+    assert quarter.value == pytest.approx(max(after**2 - 1.0, 0.0) / (before**2 - 1.0))
+    assert rules.LEAVES_A_QUARTER.applies(r) == (after > settings.UNKNOWN)
+
+
 @given(bad=st.sampled_from([np.nan, np.inf]), at=st.integers(0, BLOCKS - 1))
 @settings_of(max_examples=examples(20), deadline=None)
 def test_an_error_that_is_not_finite_is_never_accepted(bad: float, at: int) -> None:
@@ -110,6 +216,24 @@ def test_every_rule_has_a_name_of_its_own_and_a_sentence_for_its_reason() -> Non
     tables = [r for v in vars(rules).values() if isinstance(v, tuple) for r in v if isinstance(r, rules.Rule)]
     assert {id(r) for r in (*objects, *tables)} == {id(r) for r in RULES.values()}
     assert all(r.reason[0].isupper() and r.reason.endswith(".") and r.unit for r in RULES.values())
+
+
+def test_a_number_may_reach_its_limit_from_the_side_that_the_rule_allows() -> None:
+    most = {
+        "energy given back", "memory confirmed", "validation logs", "best log", "other subsystems", "physical range",
+        "cause", "excess left", "worst output", "error left",
+    }  # fmt: skip
+    for rule in RULES.values():
+        at = replace(rule, limit=lambda _: 1.0)
+        holds = [replace(at, measure=lambda _, v=v: v).verdict(None).holds for v in (0.999, 1.0, 1.001, np.nan)]
+        assert holds == ([True, True, False, False] if rule.name in most else [False, True, True, False]), rule.name
+    assert [rules.CONFIRMED.verdict(rules.Confirmation(left, 0.4)).holds for left in (0.3, np.inf)] == [True, False]
+    given = settings.NEGATIVE_STOPS
+    assert [rules.DISSIPATES.verdict(share).holds for share in (0.9 * given, 1.1 * given)] == [True, False]
+    for at_bound, better in ((False, False), (True, False), (False, True)):
+        within, cause = (rule.verdict(rules.Naming(at_bound, "time", better)) for rule in rules.NAMED)
+        assert (within.holds, cause.holds) == (not at_bound, not better)
+    assert [rules.NAMED[1].applies(rules.Naming(False, cause, False)) for cause in ("", "time")] == [False, True]
 
 
 class Sums:

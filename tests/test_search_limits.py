@@ -187,7 +187,7 @@ def test_a_rival_goes_where_it_needs_three_nats_more_freedom(times: float, beyon
 def test_a_rival_goes_for_a_third_of_a_spread_and_not_for_less(times: float, beyond: bool) -> None:
     judge = judge_of(20, 10_000)
     other = fit_of(1.0 + 0.3 * times / np.sqrt(2.0 * judge.n), judge)
-    nats = gain(judge, other, fit_of(1.0, judge), 1.0)[0]
+    nats = gain(other, fit_of(1.0, judge), 1.0)[0]
     assert nats > 30.0
     assert noise_floor._worse(judge, other, fit_of(1.0, judge), 1.0, 0.0) == beyond
 

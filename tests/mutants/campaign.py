@@ -551,10 +551,12 @@ def _put(module: ModuleType, kind: str, where: str, names: tuple[str, ...], code
         _set_default(_function(module, where), names[0], space[names[0]])
         return
     if kind == FIELD:
+        owner = _owner(module, where)
         for name in names:
-            _set_field(_owner(module, where), name, space[name])
-        return
-    changed = {n: (vars(module)[n], space[n]) for n in names}
+            _set_field(owner, name, space[name])
+        names, changed = (where,), {where: (owner, owner)}  # what was made of the class has the default that it had
+    else:
+        changed = {n: (vars(module)[n], space[n]) for n in names}
     for loaded in [m for n, m in list(sys.modules.items()) if n.split(".")[0] in OURS or m is module]:
         held = {n for n, (old, _) in changed.items() if n in vars(loaded) and _is_same(vars(loaded)[n], old)}
         path = Path(getattr(loaded, "__file__", None) or ROOT.parent)

@@ -117,7 +117,7 @@ class LikelihoodAcceptance:
 
     def gain(self, before: Fit, after: Fit) -> tuple[float, float]:
         """Nats and spreads."""
-        return gain(self.judge, before, after, self.correlation)
+        return gain(before, after, self.correlation)
 
     def shows(self, reach: float) -> bool:
         """Whether an effect that changes the sum of squares by so much at its largest could have been seen."""
@@ -171,7 +171,7 @@ class LikelihoodAcceptance:
             alternatives = {m: f for m, f in alternatives.items() if m == best or not at_bound(judge.stage, f, m)}
             current = alternatives[best]
             before = search.joined(rest) if rest else search.base
-            nats = gain(judge, before, current, correlation)[0]
+            nats = gain(before, current, correlation)[0]
             falls[best] = rms_of(judge, before) / max(rms_of(judge, current), 1e-300)
             freer = {m: freedom[m] - freedom[best] for m in alternatives}
             rivals = [
@@ -311,7 +311,7 @@ def _worse(judge: LeastSquaresProblem, other: Fit, best: Fit, correlation: float
     """True when the log can tell that ``other`` is not it: it explains less than ``best``, or no more though it is
     ``freer`` (nats).
     """
-    nats, spreads = gain(judge, other, best, correlation)
+    nats, spreads = gain(other, best, correlation)
     less = nats > rival_nats(judge, float(best.held_out.sum()), correlation) and spreads > RIVAL_SPREADS
     return less or min(nats, 0.0) + freer > RIVAL_NATS
 

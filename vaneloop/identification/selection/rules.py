@@ -171,7 +171,7 @@ class Comparison:
     @cached_property
     def gain(self) -> tuple[float, float]:
         """Gain of log-likelihood, and fall of the RMS error in standard deviations; see `gain`."""
-        return gain(self.judge, self.before, self.after, self.correlation)
+        return gain(self.before, self.after, self.correlation)
 
     @cached_property
     def block_changes(self) -> Array:
@@ -233,7 +233,7 @@ class Comparison:
         return np.maximum(fit.held_out[use], self.judge.samples[use].astype(float) * least * least)
 
 
-def gain(judge: LeastSquaresProblem, before: Fit, after: Fit, correlation: float) -> tuple[float, float]:
+def gain(before: Fit, after: Fit, correlation: float) -> tuple[float, float]:
     """Return what ``after`` gains over ``before`` on held-out blocks.
 
     The first number is the gain of log-likelihood: half the fall of the normalised sum of squares, divided by how many
@@ -242,14 +242,9 @@ def gain(judge: LeastSquaresProblem, before: Fit, after: Fit, correlation: float
     """
     d = before.held_out - after.held_out
     likelihood = 0.5 * float(d.sum()) / correlation
-    n = max(judge.n, 1)
-    deviation = np.sqrt(correlation / (2.0 * n))
-    rms = [np.sqrt(max(f.held_out.sum(), 0.0) / n) for f in (before, after)]
-    overall = (rms[0] - rms[1]) / deviation
-    m = np.maximum(judge.samples, 1)
-    local = (np.sqrt(np.maximum(before.held_out, 0.0) / m) - np.sqrt(np.maximum(after.held_out, 0.0) / m)) / np.sqrt(
-        correlation / (2.0 * m)
-    )
+    # the root of a sum of squares of noise has the same variance, correlation / 2, whatever the number of samples
+    sums = [np.append(f.held_out, f.held_out.sum()) for f in (before, after)]
+    *local, overall = (np.sqrt(np.maximum(sums[0], 0.0)) - np.sqrt(np.maximum(sums[1], 0.0))) / np.sqrt(correlation / 2)
     return likelihood, max(float(overall), SPREADS / BLOCK_SPREADS * float(np.sort(local)[-2:].mean()))
 
 
@@ -329,9 +324,8 @@ class AllRows:
     @property
     def fall(self) -> float:
         """Fall of the RMS error of all samples, in standard deviations of independent noise."""
-        n = max(sum(self.many.values()), 1)
-        was, now = (np.sqrt(sum(of.values()) / n) for of in self.squares)
-        return float((was - now) * np.sqrt(2.0 * n))
+        was, now = (np.sqrt(sum(of.values())) for of in self.squares)
+        return float((was - now) * np.sqrt(2.0))
 
     def objection(self) -> str:
         """Why the curve is not believed, in words; "": it is."""
@@ -436,8 +430,8 @@ class Naming:
     """
 
     at_bound: bool
-    cause: str = ""
-    other_is_better: bool = False
+    cause: str
+    other_is_better: bool
 
 
 NAMED = (

@@ -126,7 +126,7 @@ def divergence(
     judge = LeastSquaresProblem(s, floor_of(s))
     search = Search(LikelihoodAcceptance(judge))
     best, other = (search.joined((*beside, name)) for name in (named, rival))
-    return gain(judge, other, best, correlation_of(judge, best))
+    return gain(other, best, correlation_of(judge, best))
 
 
 def _columns(stage: Any, effects: tuple[str, ...]) -> list[int]:
