@@ -15,7 +15,7 @@ import pytest
 from tests.conftest import ROOT
 from tests.mutants import campaign as trial
 from tests.mutants.__main__ import ENOUGH, STRICT, TARGETS
-from tests.mutants.mutate import PRODUCT, mutants_of
+from tests.mutants.mutate import PRODUCT, made_of, mutants_of
 
 TINY = '''
 from dataclasses import dataclass
@@ -152,6 +152,7 @@ def test_what_a_module_makes_of_a_class_is_made_anew_with_a_field_s_other_defaul
     monkeypatch.setattr(trial, "ROOT", tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     made: Any = importlib.import_module("made")
+    assert made_of(tmp_path, "made.py", ("Range",)) == {"Range", "USUAL", "HIGH", "BOTH"}
     (m,) = (m for m in mutants_of(tmp_path, "made.py") if m.becomes == "low: float = 1.0")
     trial._put(made, m.kind, m.where, m.names, m.code())
     assert [(r.low, r.high) for r in (made.Range(), *made.BOTH)] == [(1.0, 2.0), (1.0, 2.0), (1.0, 9.0)]

@@ -5,6 +5,7 @@ makes, what it names, exchanges, takes out and leaves unnamed.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,16 +17,18 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
 from tests.conftest import examples
-from vaneloop.identification import Effect, Parameter, Stage
+from vaneloop.identification import Effect, Parameter, Stage, StageError
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import StageDiagnosis, rms_of
 from vaneloop.identification.selection import likelihood_acceptance as likelihood
-from vaneloop.identification.selection.diagnosis import _search, diagnose_stage
+from vaneloop.identification.selection.calibration import trust
+from vaneloop.identification.selection.diagnosis import _search, diagnose_stage, extend_stage
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
 from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance, score, structure
 from vaneloop.identification.selection.screening import Linearisation, along, onward, out_of, within
 from vaneloop.identification.selection.search import Search
-from vaneloop.identification.settings import PER_PARAMETER, RIVAL
+from vaneloop.identification.selection.subsampled_search import SubsampledSearch, excerpt_of, searched
+from vaneloop.identification.settings import PER_PARAMETER, RIVAL, TRUST_COEFFICIENTS, TRUST_MOST_FALL, TRUST_MOST_LEFT
 from vaneloop.identification.subsystem import Array
 
 N = 240
@@ -429,3 +432,295 @@ def test_a_model_with_two_valleys_begins_wherever_its_stage_says_that_it_may() -
         assert -1.5 < searches[0].base.theta[0] < -0.5
         assert [s.base.theta[0] for s in searches[1:]] == pytest.approx([2.0, 2.0], abs=0.05)
         assert [len(s.nominal) for s in searches] == [1, 2, 3]
+
+
+# ---- how an effect is fitted -----------------------------------------------------------------------------------------
+
+
+def turning(seed: int, size: float, angle: float, starts: tuple[tuple[float, float], ...]) -> Stage:
+    """A stage that lacks a force of a size in a direction in the plane."""
+    x = waves(seed, 4)
+    parameters = (
+        Parameter("size", 0.0, "1", 0.0, 50.0), Parameter("angle", 0.0, "rad", 0.0, 2.0 * np.pi, shape=True, scale=1.0,
+                                                          period=2.0 * np.pi),
+    )  # fmt: skip
+
+    def run(thetas: Array) -> Array:
+        gain, size, angle = thetas.T[:, :, None]
+        return (gain * x[0] + size * (np.cos(angle) * x[1] + np.sin(angle) * x[2]))[:, None, :]
+
+    return Stage(
+        "plane", ("y",), ("1",), (Parameter("gain", 1.0, "1", 0.0, 2.0, 0.5),), (Effect("force", parameters, starts),),
+        run, T, run(np.array([[1.1, size, angle]]))[0] + FLOOR * x[3:], floor=np.array([FLOOR]),
+    )  # fmt: skip
+
+
+@CRITERIA
+@given(size=st.floats(0.5, 9.0), angle=st.floats(0.0, 6.28))
+@settings_of(max_examples=examples(5), deadline=None)
+def test_a_direction_is_found_wherever_it_points(criterion: Any, size: float, angle: float) -> None:
+    stage = turning(21, size, angle, ((1.0, 0.0),))
+    search = Search(criterion(LeastSquaresProblem(stage, np.array([FLOOR]))))
+    found = search.single("force").theta
+    assert found[1] == pytest.approx(size, rel=0.2, abs=0.05)
+    assert np.cos(found[2] - angle) > 0.99
+
+
+def test_from_each_direction_a_fit_begins_with_the_size_that_is_best_there() -> None:
+    stage = turning(22, 4.0, 1.0, ((1.0, 0.0),))
+    judge = LeastSquaresProblem(stage, np.array([FLOOR]))
+    search = Search(LikelihoodAcceptance(judge))
+    base = search.base
+    e0, jac = judge.linearise(base.theta, base.free)
+    thetas = search._turned(stage.effects[0], e0, jac)
+    assert [t[2] for t in thetas] == pytest.approx([2.0 * np.pi * k / len(thetas) for k in range(len(thetas))])
+    x, prior = waves(22, 4), np.sqrt(base.prior[0])
+    measured = stage.measured[0] / FLOOR
+    for theta in thetas:
+        way = np.cos(theta[2]) * x[1] + np.sin(theta[2]) * x[2]
+        a = np.vstack([np.column_stack([x[0], way]) / FLOOR, [prior, 0.0]])
+        straight = np.linalg.lstsq(a, np.append(measured, prior), rcond=None)[0]
+        if straight[1] < 0.0:  # a force has no negative size
+            assert theta[1] == 0.0
+        elif abs(straight[0] - 1.0) < 0.5:  # else the gain stands at its limit
+            assert theta[:2] == pytest.approx(straight, abs=0.02)
+    plain = linear({effect("a"): x[1]}, x[0], x[0])
+    still = Search(LikelihoodAcceptance(LeastSquaresProblem(plain, np.array([FLOOR]))))
+    assert still._turned(plain.effects[0], e0, jac) == []
+
+
+@CRITERIA
+@pytest.mark.parametrize("truth", [0.83, 1.7, 4.6])
+def test_a_size_that_acts_in_steps_is_found_between_its_starts(criterion: Any, truth: float) -> None:
+    x = waves(23, 3)
+
+    def run(thetas: Array) -> Array:  # in whole steps of a tenth, so that it has no slope
+        return (thetas[:, :1] * x[0] + np.floor(10.0 * thetas[:, 1:2] + 0.5) / 10.0 * x[1])[:, None, :]
+
+    steps = Effect("steps", (Parameter("size", 0.0, "1", 0.0, 9.0),), ((0.5,), (1.0,), (2.0,), (5.0,)))
+    stage = Stage(
+        "s", ("y",), ("1",), (Parameter("gain", 1.0, "1", 0.0, 2.0, 0.5),), (steps,), run, T,
+        run(np.array([[1.0, truth]]))[0] + FLOOR * x[2:], floor=np.array([FLOOR]),
+    )  # fmt: skip
+    search = Search(criterion(LeastSquaresProblem(stage, np.array([FLOOR]))))
+    found = search.single("steps")
+    assert found.theta[1] == pytest.approx(truth, abs=0.11)
+    assert search.judge.total_of(found) < 1.0 * search.judge.total_of(search.base)
+
+
+@CRITERIA
+def test_a_law_is_never_worse_than_one_that_it_holds_and_that_one_is_reached_from_it(criterion: Any) -> None:
+    x = waves(24, 4)
+    shape = Parameter("fade", 0.0, "1", 0.0, 99.0, shape=True, scale=1.0)
+    wide = Effect(
+        "wide", (Parameter("size", 0.0, "1", -50.0, 50.0), shape), ((1.0, 90.0),), holds=(("narrow", (None, 0.0)),)
+    )  # where it begins, it does nothing
+
+    def run(thetas: Array) -> Array:
+        gain, wide, fade, narrow = thetas.T[:, :, None]
+        return (gain * x[0] + (narrow + wide * np.exp(-fade * np.abs(x[2]))) * x[1])[:, None, :]
+
+    stage = Stage(
+        "s", ("y",), ("1",), (Parameter("gain", 1.0, "1", 0.0, 2.0, 0.5),), (wide, effect("narrow")), run, T,
+        run(np.array([[1.0, 3.0, 0.1, 0.0]]))[0] + FLOOR * x[3:], floor=np.array([FLOOR]),
+    )  # fmt: skip
+    judge = LeastSquaresProblem(stage, np.array([FLOOR]))
+    search = Search(criterion(judge))
+    narrow = search.single("narrow")
+    wider = search.single("wide")
+    assert judge.total_of(wider) < 1.3 * judge.n < judge.total_of(narrow)
+    assert wider.theta[[1, 2, 3]] == pytest.approx([3.0, 0.1, 0.0], abs=0.05)
+    search.fits.pop(frozenset(["narrow"]))
+    (simpler,) = search.simpler(wider, "wide")
+    assert simpler.effects == ("narrow",) and simpler.theta == pytest.approx(narrow.theta, abs=1e-3)
+    assert search.fits[frozenset(["narrow"])] is simpler
+    assert search.simpler(narrow, "narrow") == []
+
+
+# ---- names -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("alike", [0.0, 1.0], ids=["apart", "together"])
+@pytest.mark.parametrize("truth", ["time", "temperature"])
+def test_a_law_with_another_cause_is_told_from_it_or_said_to_be_inseparable(truth: str, alike: float) -> None:
+    x = waves(25, 4)
+    other = alike * x[1] + (1.0 - alike) * x[2]
+    of = {"time": x[1], "temperature": other}
+
+    def run(cause: str) -> Any:
+        return lambda thetas: (thetas[:, :1] * x[0] + thetas[:, 1:2] * of[cause])[:, None, :]
+
+    stage = Stage(
+        "s", ("y",), ("1",), (Parameter("gain", 1.0, "1", 0.0, 2.0, 0.5),), (effect("drift"),), run("time"), T,
+        run(truth)(np.array([[1.0, 0.5]]))[0] + FLOOR * x[3:], floor=np.array([FLOOR]),
+        twins={"drift": ("temperature", run("temperature"))},
+        alike={"drift": lambda named: f"a leak of {named['drift']['drift0']['value']:.1f}"},
+    )  # fmt: skip
+    d = diagnose_stage(stage, np.array([FLOOR]))
+    if alike:
+        (f,) = d.effects
+        assert f.inseparable == ["temperature", "a leak of 0.5"] and not f.other_cause
+    elif truth == "time":
+        (f,) = d.effects
+        assert f.inseparable == ["a leak of 0.5"] and not f.other_cause and f.nats > 100.0
+    else:
+        assert d.verdict == "unknown" and not d.effects
+
+
+@pytest.mark.parametrize("within", [True, False])
+def test_an_effect_at_its_bound_gives_way_to_one_that_does_as_well_within(within: bool) -> None:
+    x = waves(26, 4)
+    bounded = Effect("bounded", (Parameter("size", 0.0, "1", -2.0, 2.0),), ((-1.0,), (1.0,)))
+    library = {bounded: x[1], effect("b"): 2.0 * x[1] if within else x[2]}
+    measured = x[0] + 2.0 * x[1] + FLOOR * x[3] + 0.01 * x[1]
+    d = diagnose_stage(linear(library, measured, x[0]), np.array([FLOOR]))
+    if within:
+        assert d.verdict == "missing" and names(d) == ["b"] and d.effects[0].rivals == []
+    else:
+        assert d.verdict == "unknown" and not d.effects and d.nearest == ["bounded"]
+        assert d.refused == ["bounded fits only at the end of its physical range"]
+
+
+def test_extending_tells_the_error_with_each_effect_in_the_order_in_which_they_do_most() -> None:
+    x = waves(27, 5)
+    measured = x[0] + 1.0 * x[1] + 3.0 * x[2] + FLOOR * x[3]
+    stage = linear({effect("a"): x[1], effect("b"): x[2], effect("c"): x[4]}, measured, x[0])
+    d = extend_stage(stage, ("a", "b"))
+    assert [name for name, _ in d.steps] == ["nominal", "+ b", "+ a"] and d.verdict == "missing"
+    for columns, (_, rms) in zip(([0], [0, 2], [0, 1, 2]), d.steps, strict=True):
+        least = np.linalg.lstsq(x[columns].T, measured, rcond=None)[0]
+        assert rms == pytest.approx(np.std(measured - least @ x[columns]) / FLOOR, rel=0.03)
+    assert {f.effect: f.fall for f in d.effects} == pytest.approx({"a": 10.0, "b": 30.0}, rel=0.2)
+    assert [f.parameters[f"{f.effect}0"]["value"] for f in d.effects] == pytest.approx([1.0, 3.0], abs=0.05)
+    assert extend_stage(stage, ()).verdict == "none"
+    with pytest.raises(StageError, match="no effect 'd'; it has a, b, c"):
+        extend_stage(stage, ("d",))
+
+
+def test_no_name_rests_on_a_channel_that_lacks_bits() -> None:
+    x = waves(28, 3)
+    stage = linear({effect("a"): x[1]}, x[0] + 3.0 * x[1] + FLOOR * x[2], x[0])
+    assert names(diagnose_stage(stage, np.array([FLOOR]))) == ["a"]
+    d = diagnose_stage(replace(stage, coarse={"u": "u lacks bits"}), np.array([FLOOR]))
+    assert (d.verdict, d.effects, d.nearest, d.refused) == ("unknown", [], ["a"], ["u lacks bits"])
+
+
+@given(left=st.floats(0.5, 200.0), fall=st.floats(0.5, 2e4), share=st.floats(-0.5, 1.5))
+@settings_of(max_examples=examples(20), deadline=None)
+def test_trust_is_a_logistic_function_of_what_is_left_of_the_fall_and_of_the_share(
+    left: float, fall: float, share: float
+) -> None:
+    for criterion, (one, of_left, of_fall, of_share) in TRUST_COEFFICIENTS.items():
+        score = one + of_left * np.log(min(max(left, 1.0), TRUST_MOST_LEFT))
+        score += of_fall * np.log(min(max(fall, 1.0), TRUST_MOST_FALL)) + of_share * (min(max(share, 0.0), 1.0) - 1.0)
+        p = trust(criterion, {"left": left, "fall": fall, "share": share})
+        assert np.log(p / (1.0 - p)) == pytest.approx(score, abs=1e-6)
+
+
+# ---- long logs -------------------------------------------------------------------------------------------------------
+
+LONG = 2400  # samples
+PARTS = {"LONG_SAMPLES": 2000, "EXCERPT_PIECE": 60, "EXCERPT_SAMPLES": 600}
+
+
+def long(library: dict[str, Array], measured: Array, lead: Array) -> Stage:
+    """A linear stage of many samples, of which excerpts can be taken."""
+    rows = np.vstack([lead, *library.values()])
+
+    def on(at: Any) -> Stage:
+        return Stage(
+            name="long", outputs=("y",), units=("1",), parameters=(Parameter("gain", 1.0, "1", 0.0, 2.0, 0.5),),
+            effects=tuple(effect(name) for name in library), run=lambda thetas: (thetas @ rows[:, at])[:, None, :],
+            t=0.1 * np.arange(LONG)[at], measured=measured[at], floor=np.array([FLOOR]),
+        )  # fmt: skip
+
+    return replace(on(slice(None)), excerpt=on)
+
+
+@pytest.mark.parametrize("case", ["everywhere", "in one stretch", "clean"])
+def test_what_an_excerpt_finds_is_fitted_to_the_whole_log(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in PARTS.items():
+        monkeypatch.setattr(f"vaneloop.identification.selection.diagnosis.{name}", value)
+    x = np.random.default_rng(31).standard_normal((5, LONG))
+    if case == "in one stretch":
+        x[2] *= (np.arange(LONG) >= 1000) & (np.arange(LONG) < 1080)
+    sizes = {"everywhere": (0.5, 0.3), "in one stretch": (0.5, 1.0), "clean": (0.0, 0.0)}[case]
+    measured = 1.1 * x[0] + np.array(sizes) @ x[1:3] + FLOOR * x[4]
+    stage = long({"a": x[1], "b": x[2], "c": x[3]}, measured, x[0])
+    ticks: list[int] = []
+    d = diagnose_stage(stage, np.array([FLOOR]), tick=lambda: ticks.append(1))
+    assert names(d) == ([] if case == "clean" else ["a", "b"]) and len(ticks) > (0 if case == "clean" else 3)
+    assert d.verdict == ("none" if case == "clean" else "missing")
+    columns = [0] if case == "clean" else [0, 1, 2]
+    prior = np.eye(1, len(columns)) * np.sqrt(12.0)
+    least = lsq_linear(np.vstack([x[columns].T / FLOOR, prior]), np.append(measured / FLOOR, np.sqrt(12.0)))
+    assert d.final.theta[columns] == pytest.approx(least.x, abs=1e-5) and d.final.theta[3] == 0.0
+    assert d.final.cost.sum() == pytest.approx(np.sum((measured - least.x @ x[columns]) ** 2) / FLOOR**2)
+    assert d.base.effects == () and d.base.theta[1:] == pytest.approx([0.0, 0.0, 0.0])
+    assert d.excess == pytest.approx(1.0, abs=0.05)
+    for f in d.effects:
+        k = 1 if f.effect == "a" else 2
+        assert f.parameters[f"{f.effect}0"]["value"] == pytest.approx(least.x[k], abs=1e-5)
+        without = np.linalg.lstsq(x[[0, 3 - k]].T, measured, rcond=None)
+        assert f.fall == pytest.approx(np.sqrt(without[1][0] / LONG) / FLOOR, rel=0.1)
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_a_search_ahead_on_an_excerpt_ends_at_the_fits_of_the_whole(
+    quiet: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"AHEAD_SAMPLES": 600, "SHORT_PIECE": 60}.items():
+        monkeypatch.setattr(f"vaneloop.identification.selection.subsampled_search.{name}", value)
+    x = np.random.default_rng(32).standard_normal((6, LONG))
+    measured = 1.1 * x[0] + (0.0 if quiet else 0.5 * x[1] - 0.4 * x[3]) + FLOOR * x[5]
+    stage = long({"a": x[1], "b": x[2], "c": x[3], "d": x[4]}, measured, x[0])
+    ahead = searched(LikelihoodAcceptance(LeastSquaresProblem(stage, np.array([FLOOR]))), LikelihoodAcceptance, None)
+    assert isinstance(ahead, SubsampledSearch)
+    _, fit, candidates, steps = _search(ahead)
+    assert sorted(fit.effects) == ([] if quiet else ["a", "c"]) and len(candidates) == 4
+    assert [len(s[0].split(" + ")) for s in steps[1:]] == (
+        [] if quiet else sorted(len(s[0].split(" + ")) for s in steps[1:])
+    )
+    columns = [0] if quiet else [0, 1, 3]
+    prior = np.eye(1, len(columns)) * np.sqrt(12.0)
+    least = lsq_linear(np.vstack([x[columns].T / FLOOR, prior]), np.append(measured / FLOOR, np.sqrt(12.0)))
+    assert fit.theta[columns] == pytest.approx(least.x, abs=1e-4)
+    assert ahead.judge.total_of(fit) == pytest.approx(2.0 * least.cost, rel=1e-6)
+    for name, (left, theta) in ({} if quiet else ahead._promises(ahead.base)).items():
+        k = "abcd".index(name) + 1  # what acts linearly leaves what was promised of it
+        a = np.vstack([x[[0, k]].T / FLOOR, [np.sqrt(12.0), 0.0]])
+        alone = lsq_linear(a, np.append(measured / FLOOR, np.sqrt(12.0)))
+        assert theta[[0, k]] == pytest.approx(alone.x, abs=1e-3)
+        moved = a[-1, 0] * (alone.x[0] - ahead.base.theta[0])  # a prior holds what is fitted where the base has it
+        assert left == pytest.approx(2.0 * alone.cost, abs=10.0 + abs(moved) * 1e3)
+    found, _ = ahead.criterion.name(ahead, fit, candidates)
+    assert all(f.rivals == [] and f.probability > 0.99 for f in found) and len(found) == len(fit.effects)
+
+
+@given(
+    pieces=st.integers(4, 40), piece=st.integers(5, 60), many=st.integers(1, 20), worst=st.integers(0, 39),
+    seed=st.integers(0, 99),
+)  # fmt: skip
+@settings_of(max_examples=examples(10), deadline=None)
+def test_an_excerpt_is_half_evenly_spaced_and_half_where_the_model_fails_most(
+    pieces: int, piece: int, many: int, worst: int, seed: int
+) -> None:
+    n, worst = pieces * piece + seed % piece, worst % pieces
+    error = np.random.default_rng(seed).standard_normal(n)
+    error[worst * piece : (worst + 1) * piece] += 50.0
+    stage: Any = SimpleNamespace(t=0.1 * np.arange(n), window=None, counted=None)
+    judge: Any = SimpleNamespace(stage=stage, errors=lambda _: error[None, None])
+    fit: Any = SimpleNamespace(theta=np.zeros(1))
+    at = excerpt_of(judge, fit, piece, many * piece)
+    chosen = np.unique(at // piece)
+    assert len(at) == len(chosen) * piece and np.array_equal(at, np.sort(at)) and at[-1] < pieces * piece
+    count = min(max(many, 2), pieces)
+    assert len(chosen) == count and worst in chosen
+    even = np.round(np.linspace(0, pieces - 1, count - count // 2)).astype(int)
+    assert np.isin(even, chosen).all()
+    first = excerpt_of(judge, None, piece, many * piece)  # without a fit only what is evenly spaced
+    assert np.array_equal(np.unique(first // piece), np.unique(even))
+    stage.counted = lambda rows: rows // piece % 2 == 0  # every other piece tells nothing
+    told = np.unique(excerpt_of(judge, fit, piece, many * piece) // piece)
+    if count <= (pieces + 1) // 2:
+        assert not np.any(told % 2)

@@ -124,7 +124,7 @@ NEAREST = {
         "record logs_fuzz"
     ),
     "hil.native": "native c_reference xcp",
-    "hil.loop": "loop_spec loop lanes lockstep node realtime moments replay native machines frames strategies",
+    "hil.loop": "loop_spec loop lanes lockstep node secoc realtime moments replay native machines frames strategies",
     "hil.fmu": "fmu_spec fmu",
     "hil.calibrate": "xcp uds xcp_spec",
     "hil.uds": "uds uds_spec",
@@ -136,8 +136,8 @@ NEAREST = {
     ),
     **dict.fromkeys(
         CORE,
-        "identification rules descent never_worse finite trust latest laws names search_limits search_ahead promise "
-        "directions rivals curves readings held long_logs doubts learn_slopes same_answer",
+        "selection_spec identification rules descent never_worse finite trust latest laws names search_limits "
+        "search_ahead promise directions rivals curves readings held long_logs doubts learn_slopes same_answer",
     ),
     **dict.fromkeys(
         OWN_MODELS,

@@ -12,9 +12,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
+import inspect
 import json
 import os
 import random
+import re
 import resource
 import shutil
 import signal
@@ -40,6 +42,7 @@ from .mutate import (
     PRODUCT,
     Mutant,
     derived_from,
+    made_of,
     mentions,
     mutants_of,
     own_names,
@@ -307,19 +310,22 @@ class _Campaign:
     def _mutants(self, items: list[pytest.Item], modules: dict[str, ModuleType], costs: Costs) -> None:
         by_cost = sorted(items, key=lambda item: costs[item.nodeid][0])
         of_name = mentions(ROOT, modules)
+        words = {i.nodeid: _words_of(i) for i in items}
 
         def reaching(m: Mutant) -> list[pytest.Item]:
             lines = {(m.file, n) for n in range(m.line, m.last + 1)}
+            known: frozenset[str] = frozenset()  # by which a test itself may read it
             if m.kind == DEFAULT:
                 lines = of_name[f"{m.file} {m.where}"]
             elif m.kind in (MODULE, FIELD):
                 lines = set().union(*(of_name.get(name, ()) for name in m.names))
+                known = made_of(ROOT, m.file, m.names if m.kind == MODULE else (m.where,))
             anywhere = m.kind in (MODULE, FIELD) and not lines  # only others read it
             spent = 0.0
             out: list[pytest.Item] = []
             for item in by_cost:
                 cost, run = costs[item.nodeid]
-                if anywhere or run & lines:
+                if anywhere or run & lines or words[item.nodeid] & known:
                     spent += cost
                     if out and spent > MOST_SECONDS:
                         break
@@ -359,6 +365,13 @@ class _Campaign:
                 else:
                     for m, by in killed[item.nodeid]:
                         decided(m, by)
+
+
+def _words_of(item: pytest.Item) -> frozenset[str]:
+    try:
+        return frozenset(re.findall(r"\w+", inspect.getsource(getattr(item, "function"))))  # noqa: B009
+    except (AttributeError, OSError, TypeError):  # a test that is no function
+        return frozenset()
 
 
 def _clock() -> float:

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import CodeType
 from typing import cast
 
-__all__ = ["Derived", "Mutant", "derived_from", "mentions", "mutants_of", "own_names", "with_hits"]
+__all__ = ["Derived", "Mutant", "derived_from", "made_of", "mentions", "mutants_of", "own_names", "with_hits"]
 
 COMPARISONS: dict[type, tuple[type, ...]] = {
     ast.Lt: (ast.LtE, ast.GtE), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.LtE), ast.GtE: (ast.Gt, ast.Lt),
@@ -477,6 +477,16 @@ def derived_from(root: Path, file: str) -> list[Derived]:
         for argument, field, i in _arguments(f):
             add(DEFAULT, path, (argument,), _default(f, field, i))
     return [d for _, d in sorted(out, key=lambda d: d[0])]
+
+
+@lru_cache(maxsize=256)
+def made_of(root: Path, file: str, names: tuple[str, ...]) -> frozenset[str]:
+    """These constants or classes, and the constants that the file makes of them."""
+    out = set(names)
+    for d in derived_from(root, file):  # in the order of the lines
+        if d.kind == MODULE and d.reads & out:
+            out.update(d.names)
+    return frozenset(out)
 
 
 def own_names(root: Path, file: str) -> set[str]:

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
-from vaneloop.identification.results import Candidate, StageDiagnosis, answer_of, found_of, parameters_of, rms_of
+from vaneloop.identification.results import Candidate, StageDiagnosis, answer_of, found_of, rms_of
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
 from vaneloop.identification.selection.search import Criterion, Search
 from vaneloop.identification.selection.stepwise import eliminate, stepwise
@@ -94,20 +94,26 @@ def _confirm(
         if judge.total_of(current) > judge.total_of(nominal):  # what suits the excerpt may suit nothing else
             current = judge.fit(chosen, nominal.theta, 8)
     criterion.learn(current)
+    less: dict[str, Fit] = {}  # of the latest model, without each of its effects
 
     def without(fit: Fit) -> list[Fit]:
         rest = [tuple(c for c in fit.effects if c != name) for name in fit.effects]
         begins = (np.where(_allowed(stage, r), fit.theta, stage.neutral()) for r in rest)
-        return (
+        fits = (
             [nominal]
             if rest == [()]
             else judge.together([judge.fitting(r, b, 6) for r, b in zip(rest, begins, strict=True)])
         )
+        less.update(zip(fit.effects, fits, strict=True))
+        return fits
 
     current = eliminate(current, without, criterion.accepts, lambda idle: idle[0])
     chosen = current.effects
+    whole = {f.effect: f for f in found_of(judge, current, chosen, less)}
     effects = [
-        replace(f, parameters=parameters_of(stage, current, f.effect)) for f in said.effects if f.effect in chosen
+        replace(f, parameters=whole[f.effect].parameters, fall=whole[f.effect].fall)
+        for f in said.effects
+        if f.effect in chosen
     ]
     steps = [("nominal", rms_of(judge, nominal))]
     if chosen:
