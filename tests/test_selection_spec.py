@@ -28,7 +28,15 @@ from vaneloop.identification.selection.relative_error_acceptance import Relative
 from vaneloop.identification.selection.screening import Linearisation, along, onward, out_of, within
 from vaneloop.identification.selection.search import Search
 from vaneloop.identification.selection.subsampled_search import SubsampledSearch, excerpt_of, searched
-from vaneloop.identification.settings import PER_PARAMETER, RIVAL, TRUST_COEFFICIENTS, TRUST_MOST_FALL, TRUST_MOST_LEFT
+from vaneloop.identification.settings import (
+    NATS,
+    PER_PARAMETER,
+    RIVAL,
+    SAME_SIZE,
+    TRUST_COEFFICIENTS,
+    TRUST_MOST_FALL,
+    TRUST_MOST_LEFT,
+)
 from vaneloop.identification.subsystem import Array
 
 N = 240
@@ -93,6 +101,64 @@ def test_every_fit_of_a_search_is_the_one_that_linear_algebra_makes(criterion: A
         assert judge.total_of(f) == pytest.approx(2.0 * least.cost, rel=1e-6 if free else 1e-2), key
         others = np.setdiff1d(np.arange(5), columns)
         assert np.array_equal(f.theta[others], np.zeros(len(others)))
+
+
+@CRITERIA
+@pytest.mark.parametrize("quick", [False, True])
+def test_a_screening_promises_what_linear_algebra_leaves(criterion: Any, quick: bool) -> None:
+    x = waves(41, 5)
+    measured = 1.1 * x[0] + 0.9 * x[1] + 0.2 * x[2] + FLOOR * x[4]
+    starts = (0.1, 0.8, 4.0)
+    stage = linear({effect(c, starts=starts): x[k + 1] for k, c in enumerate("abc")}, measured, x[0], quick=quick)
+    search = Search(criterion(LeastSquaresProblem(stage, np.array([FLOOR]))))
+    for k, name in enumerate("abc", 1):
+        left = {s: np.linalg.lstsq(x[:1].T, measured - s * x[k], rcond=None)[1][0] / FLOOR**2 for s in starts}
+        best = np.linalg.lstsq(x[[0, k]].T, measured, rcond=None)
+        better = search.criterion.roams and best[0][1] > 0.0  # the size that is best follows from that of a start
+        levels = [*left.values(), *([best[1][0] / FLOOR**2] if better else [])]
+        assert search.level[name] == pytest.approx(min(levels), rel=1e-3)
+        base = search.base.cost.sum()
+        assert search.reach[name] == pytest.approx(max(abs(v - base) for v in levels), rel=1e-3)
+        begins = search.starts[name][0][k]
+        nearest = min(left, key=lambda s: left[s])
+        assert begins == (pytest.approx(best[0][1], rel=SAME_SIZE[1] - 1.0) if better else nearest)
+
+
+def test_of_a_great_library_those_are_fitted_that_promise_most() -> None:
+    x = waves(42, 13)
+    truth = {"e2": 3.0, "e7": -2.0}
+    measured = x[0] + sum(size * x[int(name[1:]) + 1] for name, size in truth.items()) + FLOOR * 5.0 * x[12]
+    stage = linear({effect(f"e{k}"): x[k + 1] for k in range(11)}, measured, x[0])
+    judge = LeastSquaresProblem(stage, np.array([FLOOR]))
+    search, fit, candidates, _ = _search(Search(RelativeErrorAcceptance(judge)))
+    assert set(fit.effects) == set(truth) and len(candidates) == RelativeErrorAcceptance.fitted == 8
+    assert candidates[0].effect == "e2" and {c.effect for c in candidates} >= set(truth)
+    pairs = {key for key in search.fits if len(key) == 2}
+    assert pairs and all(key & set(truth) for key in pairs)
+    assert search.passed and all(len(key) > 1 for key in search.passed)
+
+
+@pytest.mark.parametrize(("parameters", "named"), [(1, ["a", "wide"]), (4, ["a"])])
+def test_of_effects_that_do_equally_well_the_freer_one_is_no_rival(parameters: int, named: list[str]) -> None:
+    x = waves(43, 8)
+    measured = x[0] + 3.0 * x[1] + FLOOR * x[2]
+    wide = effect("wide", parameters)
+    d = diagnose_stage(
+        linear({wide: x[[1, 3, 4, 5][:parameters]], effect("a"): x[1]}, measured, x[0]), np.array([FLOOR])
+    )
+    (f,) = d.effects
+    assert sorted([f.effect, *f.rivals]) == named
+    assert f.effect == "a" or parameters == 1
+
+
+@given(nats=st.floats(0.1, 100.0), correlation=st.floats(1.0, 9.0))
+@settings_of(max_examples=examples(15), deadline=None)
+def test_what_could_change_the_squares_by_twice_the_nats_would_have_been_seen(nats: float, correlation: float) -> None:
+    judge: Any = SimpleNamespace()
+    criterion = LikelihoodAcceptance(judge)
+    criterion.correlation = correlation
+    assert criterion.shows(2.0 * nats * correlation) == (nats >= NATS)
+    assert RelativeErrorAcceptance(judge).shows(nats) and not RelativeErrorAcceptance(judge).shows(0.0)
 
 
 @given(seed=st.integers(0, 1000), parameters=st.integers(0, 3), blocks=st.booleans())
