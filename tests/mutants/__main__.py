@@ -124,7 +124,10 @@ NEAREST = {
         "record logs_fuzz"
     ),
     "hil.native": "native c_reference xcp",
-    "hil.loop": "loop_spec loop lanes lockstep node secoc realtime moments replay native machines frames strategies",
+    "hil.loop": (
+        "loop_spec loop lanes lockstep node secoc realtime moments replay native machines frames strategies "
+        "scenarios_in_lanes gpu"
+    ),
     "hil.fmu": "fmu_spec fmu",
     "hil.calibrate": "xcp uds xcp_spec",
     "hil.uds": "uds uds_spec",
@@ -166,6 +169,7 @@ NEAREST = {
     ),
     "vaneloop.web": "web moments",
 }
+OF_A_GPU = {"hil.loop": ("cuda.py",)}  # a part of its own: numba's simulator runs it in another process
 STRICTLY = ("controller", "hil.bus", "hil.calibrate", "hil.uds", *CORE)
 TARGETS += tuple(
     Target(
@@ -174,10 +178,12 @@ TARGETS += tuple(
         tuple(f"tests/test_{name}.py" for name in tests.split()),
         compiled=True,
         enough=STRICT if package in STRICTLY else ENOUGH,
+        but=OF_A_GPU.get(package, ()),
         thresholds=under(package),
     )
     for package, tests in NEAREST.items()
 )
+TARGETS += (Target("hil.loop.cuda", ("hil/loop/cuda.py",), ("tests/test_gpu.py",), compiled=True),)
 # What numba compiles of them, uncompiled: with those of these tests that are quick then.
 KERNELS = {
     "plant": "plant effects_reference linkage electromechanical tables curve_lanes",
