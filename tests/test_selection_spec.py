@@ -33,6 +33,7 @@ from vaneloop.identification.settings import (
     PER_PARAMETER,
     RIVAL,
     SAME_SIZE,
+    SCREEN_LINE,
     TRUST_COEFFICIENTS,
     TRUST_MOST_FALL,
     TRUST_MOST_LEFT,
@@ -368,16 +369,14 @@ def test_what_is_promised_of_a_linear_stage_is_what_scipy_finds(
     assert left == pytest.approx(np.sum((np.append(errors.ravel(), [0.0, 0.0]) - a @ clipped) ** 2), rel=1e-6)
     # how far to go: the model's own parameters follow without bounds
     e0, d = slopes.error.ravel(), (errors - slopes.error).ravel()
-    both = np.column_stack([np.vstack([a[:-2]]), -d])
-    ridge = np.zeros((2, 3))
-    ridge[:, :2] = a[-2:]
-    best = np.linalg.lstsq(np.vstack([both, ridge]), np.append(e0, [0.0, 0.0]), rcond=None)[0]
+    both = np.column_stack([a, -np.append(d, [0.0, 0.0])])
+    best = np.linalg.lstsq(both, np.append(e0, [0.0, 0.0]), rcond=None)[0]
     share, promise = slopes.line(errors[None])
-    if 0.0 < best[2] < 100.0 and np.abs(d).max() > 1e-3:
-        assert share[0] == pytest.approx(best[2], rel=1e-4, abs=1e-6)
-        assert promise[0] == pytest.approx(
-            np.sum((e0 - both @ best) ** 2) + np.sum((ridge @ best) ** 2), rel=1e-6, abs=1e-6
-        )
+    if np.abs(d).max() > 1e-3:
+        assert share[0] == pytest.approx(np.clip(best[2], *SCREEN_LINE), rel=1e-4)
+        there = np.append(e0 + share[0] * d, [0.0, 0.0])
+        least = np.linalg.lstsq(a, there, rcond=None)[0]
+        assert promise[0] == pytest.approx(np.sum((there - a @ least) ** 2), rel=1e-6, abs=1e-6)
 
 
 @given(size=st.floats(-9.0, 9.0), other=st.floats(-9.0, 9.0), share=st.floats(0.0, 12.0))

@@ -1,0 +1,376 @@
+"""Least squares on linear stages: errors, blocks, held-out errors, intervals and correlations, against numpy."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as settings_of
+from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
+
+from tests.conftest import examples
+from vaneloop.identification import Effect, Parameter, Stage, StageError
+from vaneloop.identification.least_squares.broyden import BroydenJacobian, Known, LatestSlopes, bounded_step
+from vaneloop.identification.least_squares.noise import correlation_of, floor_deviation, most_floor, tolerance
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem, covariance, recalibrate
+from vaneloop.identification.least_squares.residuals import ResidualCache
+from vaneloop.identification.results import at_bound, estimates, parameters_of, recalibrated, rms_of, rms_per_output
+from vaneloop.identification.settings import AGREES, COLOUR, DIFFERENCE, EVIDENCE, NINETY, NO_ANSWER_ERROR, SPREADS
+from vaneloop.identification.subsystem import Array, reach_of
+
+N = 240
+T = 0.5 * np.arange(N)  # s
+FLOOR = np.array([0.1, 0.3])
+
+
+def made(
+    seed: int, tolerance: float = 0.5, sizes: tuple[float, ...] = (1.2, 2.0, -1.0), high: float = 50.0, **more: Any
+) -> tuple[Stage, Array]:
+    """A stage with two outputs, linear in a gain and in two effects' sizes; and its signals, float64[3, 2, N]."""
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal((3, 2, N))
+    run = lambda thetas: np.einsum("sp,pon->son", thetas, x)  # noqa: E731
+    measured = run(np.array([sizes]))[0] + FLOOR[:, None] * rng.standard_normal((2, N))
+    effects = tuple(Effect(c, (Parameter("size", 0.0, "1", -50.0, high),), ((0.5,), (2.0,))) for c in "ab")
+    stage = Stage(
+        name="two", outputs=("y", "z"), units=("mm", "deg"), effects=effects, run=run, t=T, measured=measured,
+        parameters=(Parameter("gain", 1.0, "1", 0.0, 9.0, tolerance),), floor=FLOOR, **more,
+    )  # fmt: skip
+    return stage, x
+
+
+def whitened(stage: Stage, x: Array) -> tuple[Array, Array]:
+    """What is measured and the signals, in noise floors, as one column each: float64[2 N], float64[2 N, 3]."""
+    return (stage.measured / FLOOR[:, None]).ravel(), (x / FLOOR[:, None]).reshape(3, -1).T
+
+
+# ---- errors ----------------------------------------------------------------------------------------------------------
+
+
+@given(seed=st.integers(0, 99), window=st.sampled_from([None, 10.0, 33.0]), lost=st.floats(0.0, 0.9))
+@settings_of(max_examples=examples(10), deadline=None)
+def test_errors_are_in_noise_floors_and_free_of_a_constant_in_each_window(
+    seed: int, window: float | None, lost: float
+) -> None:
+    stage, x = made(seed, window=window)
+    rng = np.random.default_rng(seed)
+    stage.measured[rng.random((2, N)) < lost] = np.nan
+    keep = rng.random(N) < 0.9
+    judge = LeastSquaresProblem(stage, FLOOR, keep)
+    thetas = rng.standard_normal((3, 3))
+    thetas[1] = np.nan if seed % 2 else np.inf
+    expected = (stage.measured - np.einsum("sp,pon->son", thetas, x)) / FLOOR[:, None]
+    expected = np.where(np.isfinite(np.einsum("sp,pon->son", thetas, x)), expected, NO_ANSWER_ERROR)
+    counts = np.isfinite(stage.measured) & keep
+    expected = np.where(counts, expected, 0.0)
+    if window:
+        of = np.minimum((T / window + 1e-9).astype(int), max(int(T[-1] / window + 1e-9) - 1, 0))
+        for w in range(of.max() + 1):
+            here = (of == w) & counts
+            for e in expected:
+                for o in range(2):
+                    e[o, here[o]] -= e[o, here[o]].mean() if here[o].any() else 0.0
+    assert judge.errors(thetas) == pytest.approx(expected, abs=1e-9)
+    assert judge.n == counts.sum() == judge.samples.sum()
+    blocks = np.add.reduceat(np.sum(expected**2, axis=1), judge.block_start, axis=1)
+    assert judge.block_costs(judge.errors(thetas)) == pytest.approx(blocks)
+    assert np.array_equal(judge.samples, np.add.reduceat(counts.sum(axis=0), judge.block_start))
+    if window:  # a block is whole windows
+        assert all(of[i] != of[i - 1] for i in judge.block_start[1:])
+
+
+def test_what_the_raster_hides_is_expected_where_it_is_lost() -> None:
+    stage, _ = made(1)
+    judge = LeastSquaresProblem(stage, FLOOR)
+    assert np.array_equal(judge.expected(), np.ones(judge.n_blocks))
+    lost = np.zeros((4, 2, N))
+    lost[:, 0, : N // 2] = FLOOR[0] * np.array([3.0, -3.0, 1.0, 1.0])[:, None]  # a mean square of 5 noise floors
+    stage.lost = lost
+    expected = LeastSquaresProblem(stage, FLOOR).expected()
+    half = judge.block_start < N // 2
+    assert expected[half] == pytest.approx(1.0 + 0.5 * (5.0 - 2.5), rel=1e-6)
+    assert expected[~half] == pytest.approx(max(1.0 - 0.5 * 2.5, 0.1))
+
+
+def test_a_model_that_says_nothing_of_a_sample_is_refused() -> None:
+    stage, _ = made(1)
+    run = stage.run
+    stage.run = lambda thetas: np.where(np.arange(N) == 7, np.nan, run(thetas))
+    with pytest.raises(StageError, match="the model's y is no number at 3.5 s and in 2 samples; allowed: finite"):
+        recalibrate(LeastSquaresProblem(stage, FLOOR))
+    stage.measured[:, 7] = np.nan  # of what nobody measured it need say nothing
+    assert recalibrate(LeastSquaresProblem(stage, FLOOR)).effects == ()
+
+
+@given(many=st.integers(1, 12), size=st.integers(1, 4), seed=st.integers(0, 99))
+@settings_of(max_examples=examples(15), deadline=None)
+def test_what_was_simulated_is_not_simulated_again(many: int, size: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    cache, asked = ResidualCache(), 0
+
+    def simulate(thetas: Array) -> Array:
+        nonlocal asked
+        asked += len(thetas)
+        return np.repeat(thetas.sum(axis=1)[:, None, None], size, axis=2)
+
+    known: set[bytes] = set()
+    for _ in range(5):
+        thetas = rng.integers(0, 4, (many, 2)).astype(float)
+        new = {t.tobytes() for t in thetas} - known
+        asked = 0
+        out = cache.errors(thetas, simulate)
+        assert np.array_equal(out[:, 0, 0], thetas.sum(axis=1)) and out.shape == (many, 1, size)
+        assert asked == (many if len({t.tobytes() for t in thetas}) == len(new) == many else len(new))
+        known |= {t.tobytes() for t in thetas}
+        out[:] = np.nan  # whoever asked may write into it
+
+
+# ---- fits ------------------------------------------------------------------------------------------------------------
+
+
+@given(seed=st.integers(0, 99), loose=st.booleans(), left_out=st.integers(0, 5))
+@settings_of(max_examples=examples(8), deadline=None)
+def test_a_fit_is_the_least_squares_solution_and_each_block_is_held_out_of_the_effects_fit(
+    seed: int, loose: bool, left_out: int
+) -> None:
+    stage, x = made(seed, 0.5 if loose else 0.0)
+    judge = LeastSquaresProblem(stage, FLOOR)
+    fit = judge.fit(("a", "b"), stage.neutral())
+    y, a = whitened(stage, x)
+    prior = [np.sqrt(12.0), 0.0, 0.0] if loose else [1e9, 0.0, 0.0]  # 3 over the square of the tolerance
+    whole = np.linalg.lstsq(np.vstack([a, prior]), np.append(y, prior[0]), rcond=None)[0]
+    assert fit.theta == pytest.approx(whole, abs=1e-6)
+    assert judge.total_of(fit) == pytest.approx(np.sum((y - a @ whole) ** 2) + (loose * 12.0 * (whole[0] - 1.0) ** 2))
+    assert fit.free.tolist() == ([0, 1, 2] if loose else [1, 2])
+    block = np.tile(np.repeat(np.arange(judge.n_blocks), np.diff(np.append(judge.block_start, N))), 2)
+    for b in range(judge.n_blocks):  # the model's own parameters are calibrated on the whole log
+        rest = y - a[:, 0] * whole[0]
+        others = np.linalg.lstsq(a[block != b][:, 1:], rest[block != b], rcond=None)[0]
+        held = np.sum((rest[block == b] - a[block == b][:, 1:] @ others) ** 2)
+        cost = np.sum((y - a @ whole)[block == b] ** 2)
+        assert fit.cost[b] == pytest.approx(cost, rel=1e-6)
+        assert fit.held_out[b] == pytest.approx(held, rel=1e-4)
+    weights = np.ones(judge.n_blocks)
+    weights[left_out] = 0.0
+    without = judge.fit(("a", "b"), stage.neutral(), weights=weights)
+    use = np.append(block != left_out, True)
+    assert without.theta == pytest.approx(
+        np.linalg.lstsq(np.vstack([a, prior])[use], np.append(y, prior[0])[use], rcond=None)[0], abs=1e-5
+    )
+    assert rms_of(judge, fit) == pytest.approx(np.sqrt(fit.held_out.sum() / (2 * N)))
+    outputs = np.sqrt(np.mean((stage.measured - np.einsum("p,pon->on", whole, x)) ** 2, axis=1))
+    inflation = np.sqrt(fit.held_out.sum() / fit.cost.sum())
+    assert rms_per_output(judge, fit) == pytest.approx(outputs * inflation, rel=1e-6)
+
+
+@given(seed=st.integers(0, 99), loose=st.booleans())
+@settings_of(max_examples=examples(8), deadline=None)
+def test_intervals_and_correlations_follow_from_what_the_log_is_worth(seed: int, loose: bool) -> None:
+    stage, x = made(seed, 0.5 if loose else 0.0)
+    judge = LeastSquaresProblem(stage, FLOOR)
+    fit = judge.fit(("a", "b"), stage.neutral())
+    _, a = whitened(stage, x)
+    worth = min(1.0 / max(1.0, fit.cost.sum() / (2 * N)), EVIDENCE * 2 / (2 * N))  # the samples are not independent
+    information = worth * a.T @ a + np.diag([12.0, 0.0, 0.0])
+    free = slice(None) if loose else slice(1, None)
+    cov = np.linalg.inv(information[free, free])
+    half = NINETY * np.sqrt(np.diag(cov))
+    lower = fit.theta[fit.free] - fit.low
+    assert np.all(lower >= half * (1.0 - 1e-6))  # or more, where the blocks disagree
+    assert fit.high - fit.theta[fit.free] == pytest.approx(lower)
+    assert np.median(lower / half) < 1.5
+    expected = cov / np.sqrt(np.outer(np.diag(cov), np.diag(cov)))
+    assert judge.correlation(fit) == pytest.approx(expected, abs=1e-6)
+    mine = parameters_of(stage, fit, "b")["size"]
+    assert mine == {"value": fit.theta[2], "low": fit.low[-1], "high": fit.high[-1], "unit": "1"}
+    e = estimates(judge, fit)[-1]
+    assert (e.effect, e.value, e.at_bound, e.bound) == ("b", fit.theta[2], False, (-50.0, 50.0))
+    assert e.stderr == pytest.approx(lower[-1] / NINETY)
+
+
+def test_a_parameter_at_its_bound_stays_there_and_has_no_interval() -> None:
+    stage, x = made(3, high=1.5)  # a is 2.0 in truth
+    judge = LeastSquaresProblem(stage, FLOOR)
+    fit = judge.fit(("a", "b"), stage.neutral())
+    y, a = whitened(stage, x)
+    least = lsq_linear(
+        np.vstack([a, [np.sqrt(12.0), 0.0, 0.0]]), np.append(y, np.sqrt(12.0)), ([0.5, -50, -50], [1.5, 1.5, 1.5])
+    )
+    assert fit.theta == pytest.approx(least.x, abs=1e-5) and fit.theta[1] == 1.5
+    assert fit.low[1] == fit.high[1] == 1.5 and fit.low[2] < fit.theta[2] < fit.high[2]
+    assert at_bound(stage, fit, "a") and not at_bound(stage, fit, "b")
+    assert np.isnan(judge.correlation(fit)[1]).all() and np.isfinite(judge.correlation(fit)[0, 2])
+    a_size = next(e for e in estimates(judge, fit) if e.effect == "a")
+    assert a_size.at_bound and np.isnan(a_size.stderr)
+
+
+@pytest.mark.parametrize(("truth", "said", "limit"), [(1.0, False, False), (1.3, True, False), (2.5, True, True)])
+def test_a_parameter_that_moved_is_recalibrated_and_one_that_would_go_on_is_at_its_limit(
+    truth: float, said: bool, limit: bool
+) -> None:
+    stage, _ = made(4, sizes=(truth, 0.0, 0.0))
+    fit = recalibrate(LeastSquaresProblem(stage, FLOOR))
+    moved = recalibrated(stage, fit)
+    assert bool(moved) == said
+    if said:
+        assert moved[0]["parameter"] == "gain" and moved[0]["at_limit"] == limit
+        assert moved[0]["value"] == pytest.approx(min(truth, 1.5), abs=0.05)
+
+
+@pytest.mark.parametrize("kind", ["output", "log"])
+def test_parameters_that_move_different_outputs_or_logs_share_a_simulation(kind: str) -> None:
+    rng = np.random.default_rng(6)
+    x = rng.standard_normal((3, 2, N))
+    log = (np.arange(N) >= N // 2).astype(float)
+    own = [{"output": "y"}, {"output": "z"}, {}] if kind == "output" else [{"log": 0}, {"log": 1}, {}]
+    for p, of in enumerate(own):
+        x[p] *= np.array([of.get("output", "y") == "y", of.get("output", "z") == "z"])[:, None]
+        x[p] *= log == of["log"] if "log" in of else 1.0
+    asked: list[int] = []
+
+    def run(thetas: Array) -> Array:
+        asked.append(len(thetas))
+        return np.einsum("sp,pon->son", thetas, x)
+
+    stage = Stage(
+        "s", ("y", "z"), ("1", "1"),
+        tuple(Parameter(c, 1.0, "1", -9.0, 9.0, 2.0, **of) for c, of in zip("pqr", own, strict=True)),  # type: ignore
+        (), run, T, np.einsum("p,pon->on", np.array([1.5, 0.5, 2.0]), x), regimes={"log": log}, floor=FLOOR,
+    )  # fmt: skip
+    judge = LeastSquaresProblem(stage, FLOOR)
+    theta = np.array([1.0, 1.0, 3.0])  # the last at its upper end: its step goes down
+    error, slopes = judge.linearise(theta, np.arange(3))
+    assert sum(asked) == 3  # where it stands, both of those, the third
+    scale = judge.scale[:, None, None]
+    assert scale.ravel() == pytest.approx([2.0, 2.0, 2.0])
+    assert slopes == pytest.approx(x * scale / FLOOR[:, None], abs=1e-6)
+    assert error == pytest.approx((stage.measured - np.einsum("p,pon->on", theta, x)) / FLOOR[:, None])
+    thetas, _ = judge.differences(theta, np.arange(3), scale.ravel(), judge.bounds()[1])
+    assert np.abs(thetas - theta).max(axis=0) == pytest.approx(DIFFERENCE * scale.ravel())
+    assert (thetas <= judge.bounds()[1]).all()
+    costs, gradients, normals = judge.blocks(error, slopes)
+    flat = slopes.reshape(3, -1)
+    assert costs.sum() == pytest.approx(np.sum(error**2))
+    assert gradients.sum(axis=0) == pytest.approx(flat @ error.ravel())
+    assert normals.sum(axis=0) == pytest.approx(flat @ flat.T)
+
+
+def test_an_angle_has_no_bounds_and_stays_within_one_turn() -> None:
+    rng = np.random.default_rng(8)
+    x = rng.standard_normal((2, N))
+    angle = Parameter("angle", 0.0, "rad", -np.pi, np.pi, period=2.0 * np.pi, scale=1.0, shape=True)
+    run = lambda thetas: (np.cos(thetas[:, :1]) * x[0] + np.sin(thetas[:, :1]) * x[1])[:, None, :]  # noqa: E731
+    measured = run(np.array([[3.0]]))[0] + 0.1 * rng.standard_normal((1, N))
+    stage = Stage("s", ("y",), ("1",), (), (Effect("e", (angle,), ((0.0,),)),), run, T, measured, floor=FLOOR[:1])
+    judge = LeastSquaresProblem(stage, FLOOR[:1])
+    for start in (-2.9, 2.5, 9.0):
+        fit = judge.fit(("e",), np.array([start]), 20)
+        assert fit.theta[0] == pytest.approx(3.0, abs=0.03)
+        assert fit.low[0] < 3.0 < fit.high[0] and not at_bound(stage, fit, "e")
+
+
+def test_nothing_is_known_of_what_has_no_squares() -> None:
+    a = np.array([[4.0, 1.0, np.inf], [1.0, 2.0, np.nan], [np.inf, np.nan, 1.0]])
+    assert np.isinf(np.diag(covariance(a))).tolist() == [True, True, True]
+    out = covariance(np.array([[4.0, 1.0], [1.0, 2.0]]))
+    assert out == pytest.approx(np.linalg.inv(np.array([[4.0, 1.0], [1.0, 2.0]])))
+
+
+# ---- carried slopes --------------------------------------------------------------------------------------------------
+
+
+@given(seed=st.integers(0, 999), columns=st.integers(1, 4))
+@settings_of(max_examples=examples(15), deadline=None)
+def test_carried_slopes_say_what_the_last_step_did_and_change_as_little_as_that_takes(seed: int, columns: int) -> None:
+    rng = np.random.default_rng(seed)
+    error, slopes = rng.standard_normal((2, 9)), rng.standard_normal((columns, 2, 9))
+    carried = BroydenJacobian(error, slopes)
+    flat = slopes.reshape(columns, -1)
+    assert carried.gradient == pytest.approx(flat @ error.ravel())
+    step, after = rng.standard_normal(columns), rng.standard_normal((2, 9))
+    weight = np.diag(flat @ flat.T).copy()
+    carried.moved(step, after)
+    assert step @ carried.slopes == pytest.approx(error.ravel() - after.ravel())  # the secant
+    across = weight * step  # the least change in the metric of the errors
+    off = after.ravel() - error.ravel() + step @ flat
+    assert carried.slopes == pytest.approx(flat - np.outer(across, off) / (across @ step))
+    assert carried.normal == pytest.approx(carried.slopes @ carried.slopes.T)
+    assert carried.error == pytest.approx(after.ravel())
+    before = carried.slopes.copy()
+    carried.moved(np.zeros(columns), error)  # no step tells nothing
+    assert np.array_equal(carried.slopes, before) and carried.error == pytest.approx(error.ravel())
+
+
+def test_slopes_are_kept_by_the_place_and_the_columns_and_the_oldest_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vaneloop.identification.least_squares.broyden.KEPT_SLOPES", 20)
+    kept, error = LatestSlopes(), np.ones((1, 4))
+    places = [np.array([float(i), 0.0]) for i in range(4)]
+    free = np.array([0, 3])
+    for i, theta in enumerate(places):
+        kept.put(theta, free, error * i, np.full((2, 1, 4), float(i)))
+    assert [kept.get(t, free) is not None for t in places] == [False, False, True, True]
+    found = kept.get(places[3], free)
+    assert found is not None and found[0][0, 0] == 3.0 and kept.get(places[3], np.array([0, 2])) is None
+    found[1][:] = np.nan  # a copy
+    known = kept.of(places[3], free, before=3)
+    assert known.columns.tolist() == [0] and known.rows.tolist() == [[[3.0] * 4]]
+    assert known.fits(4) and not known.fits(5) and not kept.of(places[0], free).fits(4)
+    assert not Known(free, np.zeros((2, 1, 3))).fits(4)
+
+
+@given(seed=st.integers(0, 999), many=st.integers(1, 6))
+@settings_of(max_examples=examples(20), deadline=None)
+def test_a_bounded_step_is_within_and_the_rest_has_no_slope_left(seed: int, many: int) -> None:
+    rng = np.random.default_rng(seed)
+    j = rng.standard_normal((20, many))
+    a, g = j.T @ j, 6.0 * rng.standard_normal(many)
+    low, high = -rng.uniform(0.01, 1.0, many), rng.uniform(0.01, 1.0, many)
+    step = bounded_step(a, g, low, high)
+    assert np.all((step >= low) & (step <= high))
+    inside = (step > low) & (step < high)
+    assert (g - a @ step)[inside] == pytest.approx(np.zeros(inside.sum()), abs=1e-9)
+    free = np.linalg.solve(a, g)
+    if np.all((free > low) & (free < high)):
+        assert step == pytest.approx(free)
+
+
+# ---- noise -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 0.8])
+def test_so_many_samples_of_a_first_order_noise_count_as_one(rho: float) -> None:
+    rng = np.random.default_rng(9)
+    n = 60_000
+    e = rng.standard_normal((2, n))
+    for i in range(1, n):
+        e[1, i] += rho * e[1, i - 1]
+    stage: Any = SimpleNamespace(errors=lambda _: e[None] + 3.0)
+    fit: Any = SimpleNamespace(theta=np.zeros(1))
+    seen = rho ** np.arange(1, 400)
+    expected = 1.0 + 2.0 * np.sum(seen[seen > 0.05] ** 2)
+    assert correlation_of(stage, fit) == pytest.approx(expected, rel=0.03)  # of the output that tells least
+    e[1] = np.sin(np.arange(n) * 2.0 * np.pi / n)
+    assert correlation_of(stage, fit) == 50.0
+    e[:] = 0.0
+    assert correlation_of(stage, fit) == 1.0
+
+
+@given(n=st.integers(1, 10**6), m=st.integers(1, 10**6), c=st.floats(1.0, 50.0))
+@settings_of(max_examples=examples(20), deadline=None)
+def test_how_well_a_floor_is_known(n: int, m: int, c: float) -> None:
+    assert float(floor_deviation(m, n, c)) == pytest.approx(np.sqrt(c / (2.0 * m) + min(c, COLOUR[1]) / n))
+    assert most_floor(n, c) == pytest.approx(1.0 + SPREADS * np.sqrt(c / n))
+    expected = 1.0 + SPREADS * np.sqrt(c / (2.0 * n) + min(c, COLOUR[1]) / n)
+    assert tolerance(n, c) == pytest.approx(max(AGREES, expected))
+
+
+def test_what_happens_between_two_rows_raises_the_reach_where_an_effect_is_there() -> None:
+    stage, _ = made(5)
+    assert reach_of(stage, FLOOR, np.array([1.0, 2.0, 0.0])) is FLOOR
+    stage.hidden = lambda theta: np.array([0.3 * abs(theta[1]), 1e-6])
+    assert reach_of(stage, FLOOR, np.array([3.0, 0.0, 0.0])) is FLOOR  # the model's own parameter is no effect
+    assert reach_of(stage, FLOOR, np.array([1.0, 2.0, 0.0])) == pytest.approx([np.hypot(0.1, 0.6), 0.3])
