@@ -23,7 +23,7 @@ from vaneloop.identification.settings import AGREES, COLOUR, DIFFERENCE, EVIDENC
 from vaneloop.identification.subsystem import Array, reach_of
 
 N = 240
-T = 0.5 * np.arange(N)  # s
+T = 9.0 + 0.5 * np.arange(N)  # s
 FLOOR = np.array([0.1, 0.3])
 
 
@@ -68,7 +68,8 @@ def test_errors_are_in_noise_floors_and_free_of_a_constant_in_each_window(
     counts = np.isfinite(stage.measured) & keep
     expected = np.where(counts, expected, 0.0)
     if window:
-        of = np.minimum((T / window + 1e-9).astype(int), max(int(T[-1] / window + 1e-9) - 1, 0))
+        since = T - T[0]
+        of = np.minimum((since / window + 1e-9).astype(int), max(int(since[-1] / window + 1e-9) - 1, 0))
         for w in range(of.max() + 1):
             here = (of == w) & counts
             for e in expected:
@@ -92,15 +93,18 @@ def test_what_the_raster_hides_is_expected_where_it_is_lost() -> None:
     stage.lost = lost
     expected = LeastSquaresProblem(stage, FLOOR).expected()
     half = judge.block_start < N // 2
+    assert judge.n_blocks == 24 and np.array_equal(judge.block_start, np.ceil(np.arange(24) * (N - 1) / 24))
     assert expected[half] == pytest.approx(1.0 + 0.5 * (5.0 - 2.5), rel=1e-6)
     assert expected[~half] == pytest.approx(max(1.0 - 0.5 * 2.5, 0.1))
+    stage.measured[:, N // 2 :] = np.nan  # of what was measured all lost as much
+    assert LeastSquaresProblem(stage, FLOOR).expected()[half] == pytest.approx(1.0)
 
 
 def test_a_model_that_says_nothing_of_a_sample_is_refused() -> None:
     stage, _ = made(1)
     run = stage.run
     stage.run = lambda thetas: np.where(np.arange(N) == 7, np.nan, run(thetas))
-    with pytest.raises(StageError, match="the model's y is no number at 3.5 s and in 2 samples; allowed: finite"):
+    with pytest.raises(StageError, match="the model's y is no number at 12.5 s and in 2 samples; allowed: finite"):
         recalibrate(LeastSquaresProblem(stage, FLOOR))
     stage.measured[:, 7] = np.nan  # of what nobody measured it need say nothing
     assert recalibrate(LeastSquaresProblem(stage, FLOOR)).effects == ()
