@@ -139,9 +139,9 @@ NEAREST = {
     ),
     **dict.fromkeys(
         CORE,
-        "selection_spec least_squares_spec identification rules descent never_worse finite trust latest laws names "
-        "search_limits search_ahead promise directions rivals curves readings held long_logs doubts learn_slopes "
-        "same_answer",
+        "selection_spec least_squares_spec regimes_spec identification rules descent never_worse finite trust latest "
+        "laws names search_limits search_ahead promise directions rivals curves readings held long_logs doubts "
+        "learn_slopes same_answer",
     ),
     **dict.fromkeys(
         OWN_MODELS,
