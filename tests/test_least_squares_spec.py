@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,7 +21,7 @@ from vaneloop.identification.least_squares.problem import LeastSquaresProblem, c
 from vaneloop.identification.least_squares.residuals import ResidualCache
 from vaneloop.identification.results import at_bound, estimates, parameters_of, recalibrated, rms_of, rms_per_output
 from vaneloop.identification.settings import AGREES, COLOUR, DIFFERENCE, EVIDENCE, NINETY, NO_ANSWER_ERROR, SPREADS
-from vaneloop.identification.subsystem import Array, reach_of
+from vaneloop.identification.subsystem import Array, noise_of, reach_of, size_of, without_jumps
 
 N = 240
 T = 9.0 + 0.5 * np.arange(N)  # s
@@ -378,3 +379,85 @@ def test_what_happens_between_two_rows_raises_the_reach_where_an_effect_is_there
     stage.hidden = lambda theta: np.array([0.3 * abs(theta[1]), 1e-6])
     assert reach_of(stage, FLOOR, np.array([3.0, 0.0, 0.0])) is FLOOR  # the model's own parameter is no effect
     assert reach_of(stage, FLOOR, np.array([1.0, 2.0, 0.0])) == pytest.approx([np.hypot(0.1, 0.6), 0.3])
+
+
+# ---- stages ----------------------------------------------------------------------------------------------------------
+
+
+@given(
+    value=st.floats(-5.0, 5.0), tolerance=st.floats(0.0, 3.0), middle=st.one_of(st.none(), st.floats(-5.0, 5.0)),
+    low=st.floats(-9.0, -5.0), high=st.floats(5.0, 9.0),
+)  # fmt: skip
+@settings_of(max_examples=examples(25), deadline=None)
+def test_a_fit_stays_within_the_tolerance_or_at_the_value_beyond_it(
+    value: float, tolerance: float, middle: float | None, low: float, high: float
+) -> None:
+    p = Parameter("p", value, "1", low, high, tolerance, middle=middle)
+    least, most = p.limits()
+    expected = value if middle is None else middle
+    assert p.expected == expected
+    if tolerance == 0.0:
+        assert least == most == value
+    else:
+        assert least == max(low, min(value, expected - tolerance))
+        assert most == min(high, max(value, expected + tolerance))
+
+
+@given(value=st.floats(-50.0, 50.0), low=st.floats(-5.0, 5.0), period=st.floats(0.5, 9.0))
+@settings_of(max_examples=examples(25), deadline=None)
+def test_what_repeats_itself_is_within_the_turn_that_begins_at_its_low_end(
+    value: float, low: float, period: float
+) -> None:
+    p = Parameter("p", 0.0, "rad", low, low + period, period=period)
+    at = p.wrapped(value)
+    assert low - 1e-9 <= at <= low + period + 1e-9
+    turns = (value - at) / period
+    assert turns == pytest.approx(round(turns), abs=1e-9)
+    assert Parameter("p", 0.0, "1").wrapped(value) == value
+
+
+def test_a_size_is_the_first_that_says_anything() -> None:
+    assert size_of(np.nan, 0.0, -3.0, 7.0) == 3.0 and size_of(np.inf, 0.0) == 1.0 and size_of(2.0) == 2.0
+
+
+@given(seed=st.integers(0, 99), jump=st.floats(-9.0, 9.0), slope=st.floats(-1.0, 1.0))
+@settings_of(max_examples=examples(10), deadline=None)
+def test_the_jumps_of_windows_are_closed_and_what_drifts_goes_on(seed: int, jump: float, slope: float) -> None:
+    stage, _ = made(seed, window=10.0)
+    w = ((T - T[0]) / 10.0 + 1e-9).astype(int)
+    drift = slope * (T - T[0])
+    assert without_jumps(stage, drift + jump * w) == pytest.approx(drift, abs=1e-6)
+    stage.window = None
+    assert np.array_equal(without_jumps(stage, drift + jump * w), drift + jump * w)
+
+
+def test_a_floor_is_the_noise_and_what_the_raster_hides_and_no_more_than_what_is_known_to_be_quiet() -> None:
+    stage, _ = made(11)
+    stage.noise = lambda t, error: 2.0 + 0.0 * float(error[0] + t[0])
+    assert noise_of(stage, stage.neutral()).tolist() == [2.0, 2.0]
+    stage.quiet = np.array([0.5, 1.99])  # clearly less, and as good as the same
+    assert noise_of(stage, stage.neutral()).tolist() == [0.5, 2.0]
+    stage.raster_error = np.array([1.2, 0.0])
+    assert noise_of(stage, stage.neutral()) == pytest.approx([1.3, 2.0])
+    told: list[float] = []
+    stage.noise = lambda t, error: told.append(float(np.std(error))) or 1.0  # type: ignore[func-returns-value]
+    theta = np.array([1.2, 2.0, -1.0])
+    noise_of(stage, theta)
+    assert told == pytest.approx([np.std(e) for e in stage.measured - stage.run(theta[None])[0]])
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"measured": np.zeros((3, N))}, rf"measured has shape \(3, {N}\); \(2, {N}\) is needed"),
+        ({"effects": (Effect("gain", (), ()),)}, "two parameters or effects share a name among gain, gain"),
+        (
+            {"effects": (Effect("a", (Parameter("size", 0.0, "1"),), ((1.0, 2.0),)),)},
+            "effect 'a': a start has 2 values; 1 are needed",
+        ),
+    ],
+)
+def test_a_stage_that_does_not_go_together_is_refused(change: dict[str, Any], says: str) -> None:
+    stage, _ = made(12)
+    with pytest.raises(StageError, match=says):
+        replace(stage, **change)

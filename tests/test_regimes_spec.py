@@ -231,9 +231,8 @@ def test_what_is_left_is_told_as_a_function_of_what_explains_most(kind: str) -> 
     rng = np.random.default_rng(5)
     load = np.repeat(rng.uniform(0.0, 8.0, N // 8), 8)
     of = {"line": 8.0 * np.sin(2.0 * np.pi * 2.5 * T), "load": load, "time": 0.1 * T, "nothing": 0.0 * T}[kind]
-    stage = stage_of(
-        of + 0.3 * rng.standard_normal(N), {"time": T, "load": load, "direction": np.sign(np.sin(5.0 * T))}
-    )
+    conditions = {"time": T, "load": load, "direction": np.sign(np.sin(5.0 * T))}
+    stage = stage_of(of + 0.3 * rng.standard_normal(N), conditions)
     judge, fit = problem(stage)
     (s,) = shape(judge, fit)
     assert s.output == "y"
@@ -249,6 +248,10 @@ def test_what_is_left_is_told_as_a_function_of_what_explains_most(kind: str) -> 
     else:
         assert s.feature == kind and (s.x_unit, s.y_unit) == ("kN" if kind == "load" else "s", "mm")
         assert s.text.startswith(f"error of y grows linearly with {kind}, independent of direction, from ")
+        bins = np.clip(np.digitize(conditions[kind], _edges(conditions[kind])) - 1, 0, REGIME_BINS - 1)
+        for b in range(REGIME_BINS):  # the curve that is drawn
+            assert s.x[b] == pytest.approx(conditions[kind][bins == b].mean())
+            assert s.y[b] == pytest.approx(stage.measured[0, bins == b].mean())
         total = np.mean(stage.measured**2)
         expected = 1.0 - (0.3 * FLOOR) ** 2 / total
         assert s.explained == pytest.approx(expected, abs=0.06)
