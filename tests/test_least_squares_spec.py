@@ -20,8 +20,10 @@ from vaneloop.identification.least_squares.noise import correlation_of, floor_de
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, covariance, recalibrate
 from vaneloop.identification.least_squares.residuals import ResidualCache
 from vaneloop.identification.results import at_bound, estimates, parameters_of, recalibrated, rms_of, rms_per_output
-from vaneloop.identification.settings import AGREES, COLOUR, DIFFERENCE, EVIDENCE, NINETY, NO_ANSWER_ERROR, SPREADS
 from vaneloop.identification.subsystem import Array, noise_of, reach_of, size_of, without_jumps
+
+# docs/settings.md
+AGREES, SPREADS, COLOUR, NINETY, EVIDENCE, DIFFERENCE, NO_ANSWER_ERROR = 1.1, 3.0, (2.0, 5.0), 1.645, 200.0, 1e-3, 1e6
 
 N = 240
 T = 9.0 + 0.5 * np.arange(N)  # s

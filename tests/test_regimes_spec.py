@@ -33,8 +33,10 @@ from vaneloop.identification.regimes import (
 )
 from vaneloop.identification.results import Candidate, Found, StageDiagnosis
 from vaneloop.identification.selection.diagnosis import extend_stage
-from vaneloop.identification.settings import AGREES, REGIME_BINS, REGIME_LEVEL, SHORT_SEARCH, USUAL_FITS
 from vaneloop.identification.subsystem import Array
+
+# docs/settings.md
+AGREES, REGIME_BINS, REGIME_LEVEL, SHORT_SEARCH, USUAL_FITS = 1.1, 8, 0.01, 10, 60.0
 
 N = 2400
 T = 3.0 + 0.05 * np.arange(N)  # s

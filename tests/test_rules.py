@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from tests.conftest import examples
 from vaneloop import Record, System, unknown
 from vaneloop.cli import explain as command
-from vaneloop.identification import settings
 from vaneloop.identification.least_squares.problem import Fit
 from vaneloop.identification.selection import rules
 from vaneloop.identification.selection.rules import RULES, Comparison, Decision, Decisions, LogChanges, Remainder
@@ -27,6 +26,11 @@ from vaneloop.pages.decisions import decision_table, explain, reasons
 from vaneloop.pages.page import Page
 from vaneloop.verbs.learn import learn
 
+# docs/settings.md
+LIMITS = SimpleNamespace(
+    AGREE=0.05, BLOCK_SPREADS=8.0, FLAT=0.1, FLOOR_KNOWN=0.01, LEAST_FALL=0.2, LEAST_HELP=0.75, LEAST_OF_NOISE=0.1,
+    LEAST_SHARE=0.15, LEFT_FLOORS=3.0, NATS=12.0, NEGATIVE_STOPS=0.2, SPREADS=3.0, TOLERATED=1.05, UNKNOWN=1.25,
+)  # fmt: skip
 BLOCKS = 6
 LEVELS = st.lists(st.floats(0.2, 50.0), min_size=BLOCKS, max_size=BLOCKS)
 
@@ -52,9 +56,9 @@ def test_against_a_known_noise_the_rules_are_the_three_conditions(before: list[f
     gain = 0.5 * (was - now)
     deviations = (np.sqrt(was / n) - np.sqrt(now / n)) * np.sqrt(2.0 * n)
     blocks = sorted((np.sqrt(a) - np.sqrt(b)) * np.sqrt(2.0 * 50.0) for a, b in zip(before, after, strict=True))
-    local = settings.SPREADS / settings.BLOCK_SPREADS * np.mean(blocks[-2:])
-    expected = was - now >= settings.LEAST_SHARE * (was - n) and gain > settings.NATS
-    expected = expected and max(deviations, local) > settings.SPREADS
+    local = LIMITS.SPREADS / LIMITS.BLOCK_SPREADS * np.mean(blocks[-2:])
+    expected = was - now >= LIMITS.LEAST_SHARE * (was - n) and gain > LIMITS.NATS
+    expected = expected and max(deviations, local) > LIMITS.SPREADS
     assert all(r.verdict(c).holds for r in rules.KNOWN_NOISE) == expected
 
 
@@ -66,12 +70,12 @@ def test_against_an_unknown_noise_the_rules_are_the_three_conditions(
     c = comparison(before, after, form)
     a, b = (np.maximum(level, 1.0) for level in (before, after))
     noise = float(BLOCKS)
-    least = max(settings.LEAST_FALL * (a.sum() - noise), settings.LEAST_OF_NOISE * noise, form**2 * noise)
-    flat = max(1.0, settings.FLAT**2 * np.mean(before))
+    least = max(LIMITS.LEAST_FALL * (a.sum() - noise), LIMITS.LEAST_OF_NOISE * noise, form**2 * noise)
+    flat = max(1.0, LIMITS.FLAT**2 * np.mean(before))
     r = np.log(np.maximum(before, flat) / np.maximum(after, flat))
     helps = np.maximum(r, 0.0).sum() / np.abs(r).sum() if np.abs(r).sum() > 0.0 else 0.0
-    expected = a.sum() - b.sum() >= least - 1e-12 and helps >= settings.LEAST_HELP
-    expected = bool(expected and np.sum(r > settings.AGREE) >= 2)
+    expected = a.sum() - b.sum() >= least - 1e-12 and helps >= LIMITS.LEAST_HELP
+    expected = bool(expected and np.sum(r > LIMITS.AGREE) >= 2)
     assert all(rule.verdict(c).holds for rule in rules.UNKNOWN_NOISE) == expected
 
 
@@ -88,22 +92,22 @@ def test_each_rule_of_two_fits_measures_what_it_names_in_its_unit(
     assert all(r.applies(c) for r in (*rules.KNOWN_NOISE, *rules.UNKNOWN_NOISE, rules.AWAY))
     assert v["share of the excess"].value == pytest.approx(each * (a - b).sum() / beyond if beyond > 0.0 else np.inf)
     assert v["log-likelihood gain"].value == pytest.approx(0.5 * each * (a - b).sum() / correlation)
-    assert v["log-likelihood gain"].limit == settings.NATS  # of the second parameter on, one more each
+    assert v["log-likelihood gain"].limit == LIMITS.NATS  # of the second parameter on, one more each
     more = replace(c, after=replace(c.after, free=np.arange(6)))
-    assert more.further == 3 and rules.GAIN.verdict(more).limit == settings.NATS + 3.0
+    assert more.further == 3 and rules.GAIN.verdict(more).limit == LIMITS.NATS + 3.0
     whole = (np.sqrt(a.mean()) - np.sqrt(b.mean())) * np.sqrt(2.0 * n / correlation)
     local = np.sort((np.sqrt(a) - np.sqrt(b)) * np.sqrt(2.0 * each / correlation))[-2:].mean()
-    expected = max(whole, local * settings.SPREADS / settings.BLOCK_SPREADS)
+    expected = max(whole, local * LIMITS.SPREADS / LIMITS.BLOCK_SPREADS)
     assert v["fall of the error"].value == pytest.approx(expected, abs=1e-9)
     a, b = np.maximum(a, 1.0), np.maximum(b, 1.0)  # where nobody knows the noise, no block counts for less than its own
     assert v["share of the error"].value == pytest.approx(1.0 - b.sum() / a.sum(), abs=1e-12)
-    least = max(settings.LEAST_FALL * (a.sum() - BLOCKS), settings.LEAST_OF_NOISE * BLOCKS, form**2 * BLOCKS)
+    least = max(LIMITS.LEAST_FALL * (a.sum() - BLOCKS), LIMITS.LEAST_OF_NOISE * BLOCKS, form**2 * BLOCKS)
     assert v["share of the error"].limit == pytest.approx(least / a.sum())
-    flat = max(1.0, settings.FLAT**2 * np.mean(before))
+    flat = max(1.0, LIMITS.FLAT**2 * np.mean(before))
     r = np.log(np.maximum(before, flat) / np.maximum(after, flat))
     helps = np.maximum(r, 0.0).sum() / np.abs(r).sum() if np.abs(r).sum() > 0.0 else 0.0
     assert v["share improved"].value == pytest.approx(helps)
-    assert v["blocks that improve"].value == np.sum(r > settings.AGREE)
+    assert v["blocks that improve"].value == np.sum(r > LIMITS.AGREE)
 
 
 @given(
@@ -152,9 +156,9 @@ def test_of_all_rows_each_unfitted_log_and_the_whole_must_show_the_gain(before: 
     )
     assert r.fall == pytest.approx(fall, abs=1e-9)
     said = f"{r.least_gain[1]}: log-likelihood gain of {least:.1f} only"
-    if abs(least - settings.NATS) > 1e-6 and abs(fall - settings.SPREADS) > 1e-6:
-        if least >= settings.NATS:
-            said = "" if fall > settings.SPREADS else f"the error falls by {fall:.1f} standard deviations"
+    if abs(least - LIMITS.NATS) > 1e-6 and abs(fall - LIMITS.SPREADS) > 1e-6:
+        if least >= LIMITS.NATS:
+            said = "" if fall > LIMITS.SPREADS else f"the error falls by {fall:.1f} standard deviations"
         assert r.objection().startswith(said) and bool(r.objection()) == bool(said)
     fitted = replace(r, tests=frozenset())  # where every log was fitted, none of them is asked by itself
     assert not rules.UNFITTED_ROWS.applies(fitted) and fitted.least_gain[0] == np.inf
@@ -166,19 +170,45 @@ def test_what_a_set_leaves_is_measured_in_squares_beyond_the_noise(
     before: float, after: float, worst: float, effects: int
 ) -> None:
     r = Remainder(before, after, worst, effects, 10_000)
-    known = before**2 - (1.0 + settings.FLOOR_KNOWN) ** 2
+    known = before**2 - (1.0 + LIMITS.FLOOR_KNOWN) ** 2
     assert rules.EXPLAINS_HALF.verdict(r).value == pytest.approx((before**2 - after**2) / known)
     assert rules.EXPLAINS_HALF.applies(r) == (effects > 0)
     left, output = (rule.verdict(r) for rule in rules.LEAVES_LITTLE)
     assert left.value == pytest.approx(after**2 - 1.0)
-    assert left.limit == pytest.approx(settings.LEAST_SHARE * (before**2 - 1.0))
+    assert left.limit == pytest.approx(LIMITS.LEAST_SHARE * (before**2 - 1.0))
     assert output.value == max(after, worst)
-    assert output.limit == pytest.approx(1.0 + (settings.LEFT_FLOORS - 1.0) / max(effects, 1))
-    assert all(rule.applies(r) == (after > max(settings.TOLERATED, 1.0 + 3.0 / np.sqrt(2.0 * 10_000))) for rule in
+    assert output.limit == pytest.approx(1.0 + (LIMITS.LEFT_FLOORS - 1.0) / max(effects, 1))
+    assert all(rule.applies(r) == (after > max(LIMITS.TOLERATED, 1.0 + 3.0 / np.sqrt(2.0 * 10_000))) for rule in
                rules.LEAVES_LITTLE)  # fmt: skip
     quarter = rules.LEAVES_A_QUARTER.verdict(r)
     assert quarter.value == pytest.approx(max(after**2 - 1.0, 0.0) / (before**2 - 1.0))
-    assert rules.LEAVES_A_QUARTER.applies(r) == (after > settings.UNKNOWN)
+    assert rules.LEAVES_A_QUARTER.applies(r) == (after > LIMITS.UNKNOWN)
+
+
+@pytest.mark.parametrize(
+    ("rule", "after", "holds"),
+    [
+        ("share of the error", [81.0] * 6, False),  # a fifth of what is beyond noise
+        ("share of the error", [79.0] * 6, True),
+        ("blocks that improve", [95.3, 95.3, 100.0, 100.0, 100.0, 100.0], False),  # by a twentieth, in log mean square
+        ("blocks that improve", [94.9, 94.9, 100.0, 100.0, 100.0, 100.0], True),
+        ("blocks that improve", [50.0, 100.0, 100.0, 100.0, 100.0, 100.0], False),
+        ("share improved", [100.0 * np.exp(-0.74), 100.0 * np.exp(0.26), 100.0, 100.0, 100.0, 100.0], False),
+        ("share improved", [100.0 * np.exp(-0.76), 100.0 * np.exp(0.24), 100.0, 100.0, 100.0, 100.0], True),
+    ],
+)
+def test_where_nobody_knows_the_noise_the_limits_are_these(rule: str, after: list[float], holds: bool) -> None:
+    assert RULES[rule].verdict(comparison([100.0] * 6, after)).holds == holds
+    assert RULES["share of the error"].verdict(comparison([1.0 + 1e-9] * 6, [0.0] * 6)).limit == pytest.approx(0.1)
+    flat = comparison([10_000.0, *[1e-9] * 5], [10_000.0, *[1e-12] * 5])  # nearly perfect beside the others
+    assert not flat.block_changes.any()
+    # a tenth of the whole error is nearly perfect
+    whole = comparison([60_000.0, *[0.0] * 5], [60_000.0, *[0.0] * 5])
+    was, now = (whole._levels(f, 0.1 * 100.0) / 50.0 for f in (whole.before, whole.after))
+    assert was[1:] == pytest.approx([100.0] * 5) and np.array_equal(was, now)
+    c = comparison([60_000.0, 150.0, *[0.0] * 4], [60_000.0, *[0.0] * 5])
+    flat_at = LIMITS.FLAT**2 * np.mean([60_000.0, 150.0, 0.0, 0.0, 0.0, 0.0])
+    assert c.block_changes == pytest.approx([0.0, np.log(150.0 / flat_at), 0.0, 0.0, 0.0, 0.0])
 
 
 @given(bad=st.sampled_from([np.nan, np.inf]), at=st.integers(0, BLOCKS - 1))
@@ -228,7 +258,7 @@ def test_a_number_may_reach_its_limit_from_the_side_that_the_rule_allows() -> No
         holds = [replace(at, measure=lambda _, v=v: v).verdict(None).holds for v in (0.999, 1.0, 1.001, np.nan)]
         assert holds == ([True, True, False, False] if rule.name in most else [False, True, True, False]), rule.name
     assert [rules.CONFIRMED.verdict(rules.Confirmation(left, 0.4)).holds for left in (0.3, np.inf)] == [True, False]
-    given = settings.NEGATIVE_STOPS
+    given = LIMITS.NEGATIVE_STOPS
     assert [rules.DISSIPATES.verdict(share).holds for share in (0.9 * given, 1.1 * given)] == [True, False]
     for at_bound, better in ((False, False), (True, False), (False, True)):
         within, cause = (rule.verdict(rules.Naming(at_bound, "time", better)) for rule in rules.NAMED)
