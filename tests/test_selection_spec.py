@@ -372,6 +372,10 @@ def test_the_structure_of_an_error_is_what_inputs_now_and_before_predict_of_it(k
     assert structure(judge, fit) == pytest.approx(expected, abs=0.03)
     stage.regimes = {"time": t, "log": t, "y": of}  # what is no input predicts nothing
     assert structure(judge, fit) == 0.0
+    short = replace(
+        stage, t=t[:30], measured=20.0 * u[None, :30], regimes={"u": u[:30]}, run=lambda _: np.zeros((1, 1, 30))
+    )
+    assert structure(LeastSquaresProblem(short, np.array([1.0])), fit) == 0.0  # so few tell nothing
 
 
 def test_a_coefficient_that_only_stood_in_for_what_was_missing_goes_to_zero() -> None:
@@ -779,6 +783,8 @@ def test_an_effect_at_its_bound_gives_way_to_one_that_does_as_well_within(within
     else:
         assert d.verdict == "unknown" and not d.effects and d.nearest == ["bounded"]
         assert d.refused == ["bounded fits only at the end of its physical range"]
+        (last,) = (of for of in d.decisions if "physical range" in {v.rule for v in of.verdicts})
+        assert (last.added, last.beside, last.accepted) == (("bounded",), (), False)
 
 
 def test_extending_tells_the_error_with_each_effect_in_the_order_in_which_they_do_most() -> None:
@@ -803,6 +809,27 @@ def test_no_name_rests_on_a_channel_that_lacks_bits() -> None:
     assert names(diagnose_stage(stage, np.array([FLOOR]))) == ["a"]
     d = diagnose_stage(replace(stage, coarse={"u": "u lacks bits"}), np.array([FLOOR]))
     assert (d.verdict, d.effects, d.nearest, d.refused) == ("unknown", [], ["a"], ["u lacks bits"])
+    clean = linear({effect("a"): x[1]}, x[0] + FLOOR * x[2], x[0])  # nothing rests on how it is driven
+    for coarse, verdict in (("u", "none"), ("y", "unknown")):
+        assert diagnose_stage(replace(clean, coarse={coarse: "lacks bits"}), np.array([FLOOR])).verdict == verdict
+
+
+@pytest.mark.parametrize(("left", "verdict"), [(2.7, "missing"), (3.4, "unknown")])
+def test_no_output_makes_up_for_another(left: float, verdict: str) -> None:
+    x = np.random.default_rng(49).standard_normal((2, 4, N))
+    floors = np.array([FLOOR, 3.0 * FLOOR])
+
+    def run(thetas: Array) -> Array:
+        return np.einsum("sp,opn->son", thetas, x[:, :2])
+
+    measured = run(np.array([[1.0, 3.0]]))[0] + floors[:, None] * x[:, 2]
+    measured[1] += floors[1] * np.sqrt(left**2 - 1.0) * x[1, 3]
+    stage = Stage(
+        "s", ("y", "z"), ("1", "1"), (Parameter("gain", 1.0, "1", 0.0, 2.0, 0.5),), (effect("a"),), run, T, measured,
+        floor=floors,
+    )  # fmt: skip
+    d = diagnose_stage(stage, floors)
+    assert d.excess < 3.0 and (d.verdict, d.final.effects) == (verdict, ("a",))
 
 
 @given(left=st.floats(0.5, 200.0), fall=st.floats(0.5, 2e4), share=st.floats(-0.5, 1.5))
