@@ -143,6 +143,10 @@ NEAREST = {
         "laws names search_limits search_ahead promise directions rivals curves readings held long_logs doubts "
         "learn_slopes same_answer",
     ),
+    "vaneloop.identification.candidates": (
+        "candidates_spec laws own_laws curves curves_of_nobody hidden_law learn learn_band learn_confirmed "
+        "learn_differences learn_periods kept promise selection_spec"
+    ),
     **dict.fromkeys(
         OWN_MODELS,
         "laws own_laws hidden_law learn learn_beside learn_confirmed learn_creep learn_differences "
