@@ -99,6 +99,8 @@ def test_what_the_raster_hides_is_expected_where_it_is_lost() -> None:
     assert judge.n_blocks == 24 and np.array_equal(judge.block_start, np.ceil(np.arange(24) * (N - 1) / 24))
     assert expected[half] == pytest.approx(1.0 + 0.5 * (5.0 - 2.5), rel=1e-6)
     assert expected[~half] == pytest.approx(max(1.0 - 0.5 * 2.5, 0.1))
+    stage.measured[:, ::2] = np.nan  # what was not measured lost nothing
+    assert LeastSquaresProblem(stage, FLOOR).expected()[half] == pytest.approx(1.0 + 0.5 * (5.0 - 2.5), rel=1e-6)
     stage.measured[:, N // 2 :] = np.nan  # of what was measured all lost as much
     assert LeastSquaresProblem(stage, FLOOR).expected()[half] == pytest.approx(1.0)
 
