@@ -90,6 +90,9 @@ def test_every_fit_of_a_search_is_the_one_that_linear_algebra_makes(criterion: A
     assert sorted(fit.effects) == ["b", "d"] and len(search.fits) > 6
     if not search.criterion.roams:  # each fit is told, and of several effects each that is finished
         assert len(ticks) == len(search.fits) + len(search.finished)
+        leader = min((search.fits[frozenset(c)] for c in "abcd"), key=lambda f: float(f.held_out.sum()))
+        assert search.criterion.correlation == correlation_of(judge, leader)  # type: ignore[attr-defined]
+    assert not search.criterion.accepts(fit, fit)  # nothing is gained by what is there
     assert steps[0] == ("nominal", rms_of(judge, search.base)) and steps[-1][1] == rms_of(judge, fit)
     index = stage.index()
     for key, f in search.fits.items():
