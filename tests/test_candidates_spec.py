@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,6 +15,7 @@ from scipy.interpolate import BSpline
 from tests.conftest import examples
 from vaneloop.base.forms import FORMS, Form
 from vaneloop.identification.candidates.closed_forms import Formula, begin, text_of, values_of
+from vaneloop.identification.candidates.library import LAWS, Size
 from vaneloop.identification.candidates.spline_basis import Basis, basis_of, waves_of
 
 Array = np.ndarray
@@ -185,3 +189,39 @@ def test_a_curve_s_amplitudes_are_known_as_well_as_curves_are_smooth(kind: str) 
     expected = [tuple(s if i == k else 0.0 for i in range(6)) for k in range(3) for s in signs]
     assert sorted(e.starts) == sorted(expected)
     assert b.effect("curve", "N", 4.0, 0.5, [0]).parameters[0].name == "mean"
+
+
+# ---- laws ------------------------------------------------------------------------------------------------------------
+
+
+def worth(unit: str, scales: dict[str, float]) -> float:
+    """How many of the new unit an old one is, where the old base units are so many of the new ones."""
+    text = re.sub(r"(?<=[\w)]) (?=[\w(])", "*", unit).replace("^", "**")
+    return 1.0 if unit == "-" else float(eval(text, {**scales}))  # noqa: S307
+
+
+@given(scales=st.tuples(*[st.floats(0.01, 100.0)] * 5), low=st.floats(-9.0, 1.0), memory=st.booleans())
+@settings_of(max_examples=examples(10), deadline=None)
+def test_in_other_units_every_law_is_the_same_law(scales: tuple[float, ...], low: float, memory: bool) -> None:
+    u, f, v, x, s = scales  # of the values, of forces, of speeds, of displacements, of time
+    by_unit = {"U": u, "F": f, "V": v, "X": x, "s": s}
+    here = Size(
+        low, 7.0, 3.0, 11.0, 0.01, 60.0, 0.02, "U", 5.0, "F", 0.7, "V", 0.3, "X", 0.05 if memory else 0.0,
+    )  # fmt: skip
+    there = replace(
+        here, low=u * low, high=u * 7.0, rate=u / s * 3.0, fastest=u / s * 11.0, step=s * 0.01, span=s * 60.0,
+        noise=u * 0.02, force=f * 5.0, speed=v * 0.7, travel=x * 0.3, held=s * here.held,
+    )  # fmt: skip
+    for place, laws in LAWS.items():
+        for name, law in laws.items():
+            (ps, starts), (ps_there, starts_there) = law.make(here), law.make(there)
+            factor = np.array([worth(p.unit, by_unit) for p in ps])
+            told = f"{place} {name}"
+            for of in ("value", "low", "high", "tolerance", "scale"):
+                a, b = (np.array([getattr(p, of) for p in each], dtype=float) for each in (ps, ps_there))
+                assert b == pytest.approx(np.where(np.isfinite(a), factor * np.nan_to_num(a), a), rel=1e-9), told
+            assert np.array(starts_there) == pytest.approx(factor * np.array(starts), rel=1e-9), told
+            low_end, high_end = (np.array([getattr(p, end) for p in ps]) for end in ("low", "high"))
+            within = (np.array(starts) >= low_end - 1e-12) & (np.array(starts) <= high_end + 1e-12)
+            assert within.all() and all(p.low <= p.value <= p.high for p in ps), told
+            assert len({tuple(of) for of in starts}) == len(starts) and len(starts[0]) == len(ps), told
