@@ -359,6 +359,15 @@ def test_the_json_of_a_diagnosis_says_what_its_stages_say() -> None:
     assert said == [{"stage": "small", "shape": "no shape found; a why", "nearest_effects": ["a"]}]
 
 
+def test_stages_are_located_in_their_order_and_it_is_told_how_far_that_is() -> None:
+    told: list[tuple[float, str]] = []
+    stages = [small(9, 0.0), replace(small(10, 2.0), name="other")]
+    found = workflow.locate_stages(stages, lambda share, name: told.append((share, name)))
+    assert told == [(0.0, "small"), (0.5, "other")] and [at.stage for at in found] == ["small", "other"]
+    assert [at.fails for at in found] == [False, True]
+    assert [f.stage for f in workflow.compare_stages(stages)] == ["small", "other"]
+
+
 def test_a_bin_without_samples_is_never_the_worst() -> None:
     r = Regime(
         "y", "mm", "load", "", np.arange(4.0), np.array([0.1, 9.0, 0.2]), np.array([1.0, 90.0, 2.0]),
