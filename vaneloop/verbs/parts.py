@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from hil.logs import Log, LogError, read_log
+from hil.logs import Channel, Log, LogError, read_log
 from hil.logs.held import held
+from hil.logs.notes import Note
 from hil.logs.units import NO_UNIT, factor_of
 from vaneloop.base.errors import InputError, meant
 from vaneloop.base.spans import Span, apart, is_span, spans_of
@@ -160,7 +161,7 @@ def read_record(log: LogLike, system: System, **reading: Any) -> tuple[Record, l
     else:
         read = read_log(a_log(log), **reading, require=needed, signals=signals)
     reference = max((read.channels[c] for c in system.outputs if c in read.channels), key=lambda c: len(c.t))
-    t = reference.t
+    t, notes = _driven(reference.t, {c: read.channels[c] for c in (*motion, *system.inputs) if c in read.channels})
     columns = {}
     for c, channel in read.channels.items():
         step = float(np.median(np.diff(channel.t))) if len(channel.t) > 1 else 0.0
@@ -171,7 +172,25 @@ def read_record(log: LogLike, system: System, **reading: Any) -> tuple[Record, l
             v[np.minimum(np.abs(channel.t[i] - t), np.abs(t - channel.t[i - 1])) > 1.5 * step] = np.nan
         columns[c] = v
     name = Path(log if isinstance(log, str | Path) else read.path).name
-    return Record(name, t, columns), [f"{name}: {note}" for note in read.notes]
+    return Record(name, t, columns), [f"{name}: {note}" for note in (*read.notes, *notes)]
+
+
+def _driven(t: Array, drivers: Mapping[str, Channel]) -> tuple[Array, list[Note]]:
+    """The times at which all drivers are known, and notes of the others: what drove the model then nobody knows. A
+    driver is known for one step before its first sample and behind its last; of a single sample it is a constant.
+    """
+    notes = []
+    use = np.ones(len(t), dtype=bool)
+    for name, c in drivers.items():
+        if len(c.t) < 2:
+            continue
+        step = float(np.median(np.diff(c.t)))
+        known = (t > c.t[0] - 1.5 * step) & (t < c.t[-1] + 1.5 * step)
+        if not known.all():
+            said = f"{name}: logged from {c.t[0]:.5g} to {c.t[-1]:.5g} s: what is measured outside does not count"
+            notes.append(Note(said, "cut", name, int(np.count_nonzero(~known))))
+            use &= known
+    return (t, notes) if use.all() else (t[use], notes)
 
 
 def _in_units(log: Log, signals: Mapping[str, str], needed: Sequence[str]) -> Log:

@@ -41,6 +41,8 @@ from vaneloop.identification.user_models.system import Record, System
 
 __all__ = ["Data", "noise_of_channel", "noise_of_neighbours", "spikes", "without_order"]
 
+LEAST_SAMPLES = 50  # of a log
+
 
 class Data:
     """The logs that a system is held against.
@@ -92,14 +94,15 @@ class Data:
                     f"{', '.join(list(r.columns)[:12])}"
                 )
         t = no_smaller(np.asarray(r.t, dtype=float))
-        if t.ndim != 1 or len(t) < 50:
-            raise StageError(f"{r.name}: {t.size} samples; at least 50 are needed")
+        if t.ndim != 1 or len(t) < LEAST_SAMPLES:
+            raise StageError(f"{r.name}: {t.size} samples; at least {LEAST_SAMPLES} are needed")
         if not np.all(np.isfinite(t)) or np.any(np.diff(t) <= 0):
             raise StageError(f"{r.name}: time must rise from sample to sample")
         if beyond(t).any():
             raise StageError(f"{r.name}: time reaches {t[-1]:.3g} s; allowed: {LARGEST:g}")
+        t, given, begin = self._driven(r, t)
         columns = {}
-        for c, v in r.columns.items():
+        for c, v in given.items():
             v = no_smaller(np.asarray(v, dtype=float))
             if (far := beyond(v) & np.isfinite(v)).any():
                 raise StageError(f"{r.name}: channel {c!r} reaches {v[far][0]:.3g}; allowed: {LARGEST:g}")
@@ -123,7 +126,25 @@ class Data:
                 said = "1 sample left out that jumps" if n == 1 else f"{n} samples left out that jump"
                 self.notes.append(f"{r.name}: {c}: {said} away and back, first {columns[c][k]:.4g} at {t[k]:.6g} s")
                 columns[c] = np.where(away, np.nan, columns[c])
-        return Record(r.name, t - t[0], columns, r.begin)
+        return Record(r.name, t - t[0], columns, begin)
+
+    def _driven(self, r: Record, t: Array) -> tuple[Array, dict[str, Array], float]:
+        """Times and channels of a log from where all that drives the model is known to where the first of it ends, and
+        when that begins: before a driver's first sample nobody knows what drove the machine.
+        """
+        s, use = self.system, slice(0, len(t))
+        for c in (*s.inputs, s.position, s.velocity):
+            good = np.flatnonzero(np.isfinite(np.asarray(r.columns[c], dtype=float))) if c in r.columns else []
+            if len(good):
+                use = slice(max(use.start, int(good[0])), min(use.stop, int(good[-1]) + 1))
+        lost = len(t) - (use.stop - use.start)
+        if lost == 0 or use.stop - use.start < LEAST_SAMPLES:
+            return t, dict(r.columns), r.begin
+        self.notes.append(
+            f"{r.name}: {lost} samples at its ends, where what drives the model is not known, do not count"
+        )
+        cut = {c: np.asarray(v)[use] if np.shape(v) == t.shape else v for c, v in r.columns.items()}
+        return t[use], cut, r.begin + float(t[use.start] - t[0])
 
     def _prepare(self) -> None:
         s = self.system

@@ -49,7 +49,7 @@ def actuator_stage(driven: Driven) -> Stage:
     stroke = np.clip(c["x_lvdt"], 0.0, known_stroke := machine.table.actuator.stroke.value)
     leaning = np.minimum(stroke, known_stroke - stroke) < NEAR_STOP
     run = run & (leaning | ~lately(leaning, WINDOW, dt))
-    measured = np.where(run, c["x_lvdt"], np.nan)[None]
+    measured = driven.measured(run)
     stage = Stage("actuator", outputs, ("mm",), parameters, effects, simulate, t, measured, window=WINDOW)
     stage.finer = lambda thetas: simulate(thetas, step_currents(i, dt, 4 * substeps))
     ageing = like_time(t, t_oil)

@@ -8,7 +8,9 @@
 | actuator | i_cmd, n_r, p_s, t_oil  | x_lvdt                    | windows, stroke free                              |
 | linkage  | x_lvdt, n_r, t_oil      | the vanes' angles, jointly | free run, play a state                            |
 
-All stages run on one raster of 10 ms, the ECU frame's period, or the log's own where that is slower. Noise floors are
+All stages run on one raster of 10 ms, the ECU frame's period, or the log's own where that is slower. Each has the rows
+from where the last of its channels begins to where the first of them ends; a vane that begins later, or ends earlier,
+than the others is not measured there. Noise floors are
 measured on the errors of the nominal model, whose motion is mostly gone, and where the raster is slow the error that it
 causes is measured and added.
 """
@@ -16,7 +18,7 @@ causes is measured and added.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -26,7 +28,8 @@ import scipy
 from controller import Calibration, load_calibration
 from controller.records import RUN
 from hil.figures import noise_floor, resolution, resolution_before
-from hil.logs import Log, LogError
+from hil.logs import Channel, Log, LogError
+from hil.logs.notes import Note
 from hil.loop.tick import flashed
 from plant import Plant, build_plant
 from plant.curve import QUANTITIES
@@ -34,7 +37,7 @@ from plant.effects import CURVES
 from plant.layout import C_OF, CURVE_ROWS, MOST_CURVES
 from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES, same_stages
-from vaneloop.identification.settings import CHAIN_MEMORY, CURRENT_DRAWS, LEAST_FLOOR, RASTER, SETTLE
+from vaneloop.identification.settings import CHAIN_MEMORY, CURRENT_DRAWS, LEAST_FLOOR, RASTER, SETTLE, WINDOW
 from vaneloop.identification.subsystem import Array, Stage, noise_of
 from vaneloop.identification.vane_chain.actuator import actuator_stage
 from vaneloop.identification.vane_chain.alignment import aligned, late_in_controller, late_vanes
@@ -51,6 +54,7 @@ from vaneloop.identification.vane_chain.demand import demand_stage, own_demand_s
 from vaneloop.identification.vane_chain.engine import engine_stage
 from vaneloop.identification.vane_chain.linkage import linkage_stage
 from vaneloop.identification.vane_chain.resample import (
+    OF_SUBSYSTEM,
     Grid,
     every_other,
     grid_of,
@@ -62,12 +66,19 @@ from vaneloop.identification.vane_chain.resample import (
     stretches,
 )
 from vaneloop.identification.vane_chain.servo import servo_stage
-from vaneloop.identification.vane_chain.subsystem_data import Driven
+from vaneloop.identification.vane_chain.subsystem_data import SAMPLED_OF, Driven
 
 __all__ = ["STAGE_ORDER", "Chain", "build_chain"]
 
 BUS, DELAYS = {"n_dem", "n_r", "x_dem"}, ("can_delay", "frame_hold")  # channels in frames, and what delays frames
-STAGE_ORDER = ("demand", "servo", "engine", "actuator", "linkage")
+STAGE_ORDER = tuple(OF_SUBSYSTEM)
+MAKERS: dict[str, Callable[[Driven], Stage]] = {
+    "demand": demand_stage,
+    "servo": servo_stage,
+    "engine": engine_stage,
+    "actuator": actuator_stage,
+    "linkage": linkage_stage,
+}
 
 
 @dataclass(eq=False)
@@ -76,7 +87,7 @@ class Chain:
 
     stages        the stages that can be judged
     not_observed  stage -> what the log lacks
-    columns       channel -> values on the common raster ``t`` (border units), for plots
+    columns       channel -> values on the raster ``t`` of the stage that has most rows (border units)
     steps         channel -> step (border unit) in which its reading comes, where its converter's low bits are lost
     test          the stages on a part of the log that nothing is fitted to; None: there is none
     whole         of a long log, of which these are the stages of an excerpt: all of it; None: it is here whole
@@ -111,8 +122,8 @@ def build_chain(
     pieces: Sequence[tuple[int, int]] = (),
     draws: int = CURRENT_DRAWS,
 ) -> Chain:
-    """Put ``log`` on one raster and make every stage that its channels allow; channels that stand late in the file are
-    moved to where they belong (`alignment`).
+    """Put ``log`` on one raster and make every stage that its channels allow, each of the rows that its own have;
+    channels that stand late in the file are moved to where they belong (`alignment`).
 
     present  effects that the model already has: they are part of ``plant`` and not tried again
     grid     of the log, where it is known
@@ -146,10 +157,85 @@ def _build(
     machine = plant or build_plant()
     tables = calibration or load_calibration()
     same_stages(geometry=machine.vanes, vane_angles=tables.vanes)
+    grid = grid or grid_of(log)
+    absent: dict[str, str] = {}
+    together: dict[tuple[tuple[int, int], ...], list[str]] = {}  # subsystems that have the same rows
+    for name, of in OF_SUBSYSTEM.items():
+        rows = grid.pieces_of(name, pieces)
+        missing = [c for c in of.needs if c not in log.channels]
+        gives = [c for c in of.gives if c in machine.vanes or c not in VANES]
+        if name == "servo" and tables.program is not None:
+            absent[name] = "a controller of your own gives its current for its own demand, not for the logged one"
+        elif missing or not any(c in log.channels for c in gives):
+            absent[name] = "no " + ", ".join(missing or gives)
+        elif rows is None:
+            absent[name] = f"{', '.join(c for c in (*of.needs, *gives) if c in log.channels)} have no time in common"
+        else:
+            together.setdefault(rows, []).append(name)
+    chains, why = [], None
+    for rows, names in together.items() or {tuple(pieces): []}.items():
+        try:
+            chains.append(_chain(log, grid, rows, names, machine, tables, present, draws))
+        except LogError as e:
+            why = why or e
+            absent |= dict.fromkeys(names, str(e).removeprefix(f"{log.path}: "))
+    if not chains and why is not None:
+        raise why
+    longest = max(chains, key=lambda c: len(c.t))
+    absent |= {name: said for c in chains for name, said in c.not_observed.items()}
+    stages = {s.name: s for c in chains for s in c.stages}
+    return replace(
+        longest,
+        stages=[stages[name] for name in STAGE_ORDER if name in stages],
+        not_observed={name: absent[name] for name in STAGE_ORDER if name in absent},
+        notes=list(dict.fromkeys(n for c in (longest, *chains) for n in c.notes)) + _cut(log, grid, list(stages)),
+    )
+
+
+def _cut(log: Log, grid: Grid, stages: Sequence[str]) -> list[str]:
+    """Notes of the time of the log that subsystems have not, and which of their channels is at fault."""
+    many = {name: c for name, c in log.channels.items() if len(c.t) > 1}
+    edges = min(c.t[0] for c in many.values()), max(c.t[-1] for c in many.values())
+    said: dict[tuple[str, str], list[str]] = {}
+    notes: dict[str, Note] = {}
+    for name in stages:
+        of, rows = OF_SUBSYSTEM[name], grid.rows_of(name)
+        drives = [c for c in (*of.needs, *of.takes, "state") if c in many]
+        for k, (words, side) in enumerate((("begins at", "before"), ("ends at", "after"))):
+            if abs(grid.start + rows[k] * grid.dt - edges[k]) > 1.5 * WINDOW:
+                at = [c for c in (*drives, *of.gives) if c in many and grid.rows_of(c)[k] == rows[k]]
+                last = min(at, key=lambda c: (c not in drives, many[c].t[-1] if k else -many[c].t[0]))
+                said.setdefault((f"{last} {words} {many[last].t[-k]:.5g} s", side), []).append(name)
+        for c in of.gives:
+            if c in many and (grid.rows_of(c)[0] > rows[0] or grid.rows_of(c)[1] < rows[1]):
+                text = f"{c}: measured from {many[c].t[0]:.5g} to {many[c].t[-1]:.5g} s, judged there alone"
+                notes[c] = Note(text, "cut", c)
+    for (text, side), names in said.items():
+        notes[text] = Note(f"{text}: {', '.join(names)} not judged {side} it", "cut", text.split()[0])
+    return list(notes.values())
+
+
+def _chain(
+    log: Log,
+    grid: Grid,
+    pieces: Sequence[tuple[int, int]],
+    names: Sequence[str],
+    machine: Plant,
+    tables: Calibration,
+    present: tuple[str, ...],
+    draws: int,
+) -> Chain:
+    """The stages of these ``names``, which have the same rows; a channel that has not all of them is left out, but for
+    what is explained.
+    """
     cal = flashed(tables, machine)
     theirs = tables.program is not None  # a controller of the user's own: its servo's law is not known
-    grid = grid or grid_of(log)
-    t, columns, fresh, lacking, notes = on_raster(log, grid, pieces)
+    low, high = grid.rows_of(names[0]) if names else (0, grid.rows)
+    explained = {c for name in names for c in OF_SUBSYSTEM[name].gives}
+    known = {c: grid.rows_of(c) for c in log.channels}
+    part = {c: known[c] for c in known if known[c][0] > low or known[c][1] < high}
+    here = log if not part else log[[c for c in known if c not in part or c in explained]]
+    t, columns, fresh, lacking, notes = on_raster(here, grid, pieces)
     if len(t) < 500:
         raise LogError(
             f"{log.path}: {len(t)} samples of {t[1] - t[0] if len(t) > 1 else 0:g} s; at least 500 are needed to "
@@ -187,11 +273,14 @@ def _build(
     filled = machine.usual
     have = {**columns, "stretch": stretch, "spell": spell, "machine_spell": machine_spell}
     have |= {"fresh": fresh.astype(float), "missing": lacking.astype(float)}
+    for name in explained & columns.keys():
+        if (there := _sampled(log.channels[name], t, grid, known[name])) is not None:
+            have[SAMPLED_OF + name] = there.astype(float)
     for name, value in filled.items():
         if name not in have:
             have[name] = np.full(len(t), value)
-            if name == "p_s" and machine.kind != "hydraulic":
-                continue  # a motor needs no oil
+            if name in log.channels or (name == "p_s" and machine.kind != "hydraulic"):
+                continue  # no subsystem here takes it; a motor needs no oil
             notes.append(
                 f"{name}: not logged; {value:g} {UNITS[name]} assumed, and effects that need it to change cannot be "
                 f"seen"
@@ -237,33 +326,19 @@ def _build(
     step = _lost_step(log, machine)
     bits = _lost_bits(step, machine)
     steps = {"x_lvdt": step} if step else {}
-    makers: dict[str, tuple[tuple[str, ...], tuple[str, ...], Callable[[Driven], Stage]]] = {
-        "demand": (("n_dem", "n_r"), ("x_dem",), demand_stage),
-        "servo": (("x_dem", "x_lvdt"), ("i_cmd",), servo_stage),
-        "engine": (("n_dem",), ("n_r",), engine_stage),
-        "actuator": (("i_cmd",), ("x_lvdt",), actuator_stage),
-        "linkage": (("x_lvdt",), machine.vanes, linkage_stage),
-    }
     if theirs:
         cal = cal._replace(program=tables.program)
-        makers["demand"] = (("n_dem", "n_r"), ("x_dem",), own_demand_stage)
-        del makers["servo"]
+    make_of = MAKERS | ({"demand": own_demand_stage} if theirs else {})
     stages, absent = [], {}
-    for name in STAGE_ORDER:
-        if name not in makers:
-            absent[name] = "a controller of your own gives its current for its own demand, not for the logged one"
-            continue
-        needs, gives, make = makers[name]
-        missing = [c for c in needs if c not in columns]
-        outputs = tuple(c for c in gives if c in columns)
-        if missing or not outputs:
-            absent[name] = "no " + ", ".join(missing or gives)
-            continue
+    for name in names:
+        needs, _, gives = OF_SUBSYSTEM[name]
+        outputs = tuple(c for c in gives if c in columns and (c in machine.vanes or c not in VANES))
         if name in ("servo", "demand") and dt > 1.5 * RASTER:
             absent[name] = f"sample time of {dt:g} s; the controller works every 0.01 s"
             continue
         rows = law_holds if name in ("servo", "demand") else currents if name == "actuator" else machine_rows
         driven = Driven(t, have, machine, cal, outputs, rows, present, turns=turns)
+        make = make_of[name]
         stage = make(driven)
         stage.regimes, stage.regime_units = regimes, units
         if np.isfinite(stage.measured).sum() < 300:
@@ -278,7 +353,6 @@ def _build(
             coarse = make(driven.at(slice(None, None, 2), every_other(have, coarse_current), rows[::2]))
             more = rms(coarse, stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0])
             stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
-        _at_own_rate(stage, outputs, log, grid)
         if (apart := max(round(log.channels[c].apart / dt) for c in needs)) > 1:
             more = np.zeros(len(outputs))
             own, late = np.arange(0, len(t), 2 * apart), np.minimum(np.arange(len(t)) + apart // 2, len(t) - 1)
@@ -326,17 +400,17 @@ def _never_changes(values: Array) -> bool:
     return bool(np.all(known == known[:1]))
 
 
-def _at_own_rate(stage: Stage, outputs: tuple[str, ...], log: Log, grid: Grid) -> None:
-    """Count an output whose samples were joined by straight lines at its samples only: noise between them is not its
-    own.
+def _sampled(c: Channel, t: Array, grid: Grid, rows: tuple[int, int]) -> Array | None:
+    """At which of the rows ``t`` an output was sampled: between its first row and its last, and where its samples were
+    joined by straight lines at these alone, since noise between them is not its own; None: at all.
     """
-    for k, name in enumerate(outputs):
-        c = log.channels[name]
-        if c.apart > 1.5 * grid.dt:
-            when = stage.t + grid.start
-            i = np.clip(np.searchsorted(c.t, when), 1, len(c.t) - 1)
-            away = np.minimum(np.abs(c.t[i] - when), np.abs(when - c.t[i - 1]))
-            stage.measured[k, away > 0.3 * grid.dt] = np.nan
+    row = np.rint(t / grid.dt)
+    there = (row >= rows[0]) & (row < rows[1])
+    if c.apart > 1.5 * grid.dt:
+        when = t + grid.start
+        i = np.clip(np.searchsorted(c.t, when), 1, len(c.t) - 1)
+        there &= np.minimum(np.abs(c.t[i] - when), np.abs(when - c.t[i - 1])) <= 0.3 * grid.dt
+    return None if there.all() else there
 
 
 def _lost_step(log: Log, machine: Plant) -> float:

@@ -109,7 +109,7 @@ def demand_stage(driven: Driven) -> Stage:
         & np.concatenate([_direction_known(n_dem[piece], cal) for piece in pieces])
         & ~lately(c["missing"] > 0.0, 0.4)
     )
-    measured = np.where(run, c["x_dem"], np.nan)
+    measured = driven.measured(run)[0]
     at = {e.name: sum(len(f.parameters) for f in effects[:i]) for i, e in enumerate(effects)}
 
     def value(theta: Array, name: str, neutral: float) -> float:
@@ -238,4 +238,4 @@ def own_demand_stage(driven: Driven) -> Stage:
     neutral = Stage("demand", outputs, ("mm",), (), effects, simulate, t, c["x_dem"][None]).neutral()
     differs = np.abs(demanded(neutral, APPROACH) - demanded(neutral, -APPROACH)) > DEMAND_SAME
     rows = run & ~lately(differs, 0.5) & ~lately(c["missing"] > 0.0, 0.4)
-    return Stage("demand", outputs, ("mm",), (), effects, simulate, t, np.where(rows, c["x_dem"], np.nan)[None])
+    return Stage("demand", outputs, ("mm",), (), effects, simulate, t, driven.measured(rows))

@@ -50,7 +50,7 @@ def engine_stage(driven: Driven) -> Stage:
                 )
         return out[::inner].T[:, None, :]
 
-    measured = np.where(run, c["n_r"], np.nan)[None]
+    measured = driven.measured(run)
     stage = Stage("engine", outputs, ("%",), parameters, effects, simulate, t, measured)
     stage.made = Made(engine_stage, driven)
     return stage

@@ -7,7 +7,7 @@ import numpy as np
 from plant.parameters import derive
 from plant.stages import linkage_run
 from plant.stages.linkage import speed_reach
-from vaneloop.identification.settings import SETTLE
+from vaneloop.identification.settings import SETTLE, WINDOW
 from vaneloop.identification.subsystem import Array, Named, Stage
 from vaneloop.identification.vane_chain.parameters import declared, lanes, like_temperature, like_time
 from vaneloop.identification.vane_chain.resample import pieces_of, since
@@ -26,7 +26,8 @@ def linkage_stage(driven: Driven) -> Stage:
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
     t_oil = np.ascontiguousarray(c["t_oil"])
     which = [machine.vanes.index(o) for o in outputs]
-    first = [float(np.deg2rad(np.median(c[o][:5]))) if o in c else np.nan for o in machine.vanes]
+    begun = [o in c and bool(driven.sampled(o)[: round(WINDOW / dt)].any()) for o in machine.vanes]
+    first = [np.deg2rad(np.median(c[o][:5])) if b else np.nan for o, b in zip(machine.vanes, begun, strict=True)]
 
     def simulate(thetas: Array, t: Array = t, t_oil: Array = t_oil) -> Array:
         p = lanes(driven, thetas, rows, si)
@@ -49,7 +50,7 @@ def linkage_stage(driven: Driven) -> Stage:
     moved = known.any()
     if moved:
         run = run & known
-    measured = np.array([np.where(run, c[o], np.nan) for o in outputs])
+    measured = driven.measured(run)
     stage = Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, simulate, t, measured)
     stage.alike = {"pot_gain": _cross_talk}
     ageing, warming = like_time(t, t_oil), like_temperature(t, t_oil)

@@ -1,11 +1,12 @@
 """A log of the vanes on one raster: 10 ms, the ECU frame's period, or the log's own where that is slower; which rows
-count; and the conditions under which a stage may fail.
+each subsystem has; which of them count; and the conditions under which a stage may fail.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +16,15 @@ from hil.logs import Channel, Log, LogError
 from hil.logs.held import COMMANDS, answers, held, taken
 from vaneloop.base.compiled import compiled
 from vaneloop.base.sizes import no_smaller
+from vaneloop.base.vanes import VANES
 from vaneloop.identification.regimes import steady
 from vaneloop.identification.settings import CONDITION_BAND, RASTER, WINDOW
 from vaneloop.identification.subsystem import Array, Stage
 
 __all__ = [
+    "OF_SUBSYSTEM",
     "Grid",
+    "OfSubsystem",
     "every_other",
     "grid_of",
     "lately",
@@ -35,19 +39,54 @@ __all__ = [
 
 
 CONDITIONS = ("x_lvdt", "n_r", "t_oil", "p_s", "i_cmd")
+FEW = 10  # samples, up to which a channel is a constant that may begin and end anywhere
+
+
+class OfSubsystem(NamedTuple):
+    """Channels of a subsystem: it cannot do without ``needs``, is driven by ``takes`` where they are logged, and
+    explains ``gives``, or some of them.
+    """
+
+    needs: tuple[str, ...]
+    takes: tuple[str, ...]
+    gives: tuple[str, ...]
+
+
+OF_SUBSYSTEM = {
+    "demand": OfSubsystem(("n_dem", "n_r"), (), ("x_dem",)),
+    "servo": OfSubsystem(("x_dem", "x_lvdt"), (), ("i_cmd",)),
+    "engine": OfSubsystem(("n_dem",), (), ("n_r",)),
+    "actuator": OfSubsystem(("i_cmd",), ("n_r", "p_s", "t_oil"), ("x_lvdt",)),
+    "linkage": OfSubsystem(("x_lvdt",), ("n_r", "t_oil"), VANES),
+}
 
 
 class Grid(NamedTuple):
-    """The raster of a log.
+    """The raster of a log: from where the first of its subsystems is known to where the last is.
 
     start, dt, rows  s of the log's own time, s, number of rows
     steps            usual time between two samples of each channel, s
+    known            first row that each channel, or subsystem, has, and the row behind its last; those that have all
+                     may be left out
     """
 
     start: float
     dt: float
     rows: int
     steps: Mapping[str, float]
+    known: Mapping[str, tuple[int, int]] = MappingProxyType({})
+
+    def rows_of(self, name: str) -> tuple[int, int]:
+        """First row of a channel or a subsystem, and the row behind its last."""
+        return self.known.get(name, (0, self.rows))
+
+    def pieces_of(self, subsystem: str, pieces: Sequence[tuple[int, int]] = ()) -> tuple[tuple[int, int], ...] | None:
+        """These pieces of rows, as `on_raster` takes them, as far as a subsystem has them; None: it has none."""
+        low, high = self.rows_of(subsystem)
+        if (low, high) == (0, self.rows):
+            return tuple(pieces)
+        cut = ((max(first, low), min(behind, high)) for first, behind in pieces or [(0, self.rows)])
+        return tuple((first, behind) for first, behind in cut if first < behind) or None
 
     @property
     def window(self) -> int:
@@ -56,19 +95,39 @@ class Grid(NamedTuple):
 
 
 def grid_of(log: Log) -> Grid:
-    """The raster of a log: from where all channels have begun to where the first of them ends."""
+    """The raster of a log. What begins within a window of the first subsystem begins with it, and ends likewise; what
+    begins later does so in whole windows.
+    """
     channels = log.channels
     times = {id(c.t): c.t for c in channels.values()}  # channels of a table share one
-    known = {i: float(np.median(np.diff(t))) if len(t) > 1 else np.inf for i, t in times.items()}
-    steps = {name: known[id(c.t)] for name, c in channels.items()}
-    usual = [steps[name] for name, c in channels.items() if len(c.t) > 10]
-    if not usual:
-        raise LogError(f"{log.path}: no channel has more than 10 samples")
-    dt = max(RASTER, round(float(np.median(usual)) / RASTER) * RASTER)
-    start = max(c.t[0] for c in channels.values() if len(c.t) > 10)
-    end = min(c.t[-1] for c in channels.values() if len(c.t) > 10)
+    usually = {i: float(np.median(np.diff(t))) if len(t) > 1 else np.inf for i, t in times.items()}
+    steps = {name: usually[id(c.t)] for name, c in channels.items()}
+    many = {name: (float(c.t[0]), float(c.t[-1])) for name, c in channels.items() if len(c.t) > FEW}
+    if not many:
+        raise LogError(f"{log.path}: no channel has more than {FEW} samples")
+    dt = max(RASTER, round(float(np.median([steps[name] for name in many])) / RASTER) * RASTER)
+    spans = {}
+    for name, of in OF_SUBSYSTEM.items():
+        gives = [many[c] for c in of.gives if c in many]
+        if gives and all(c in channels for c in of.needs):
+            own = [many[c] for c in (*of.needs, *of.takes, "state") if c in many]
+            own.append((min(s[0] for s in gives), max(s[1] for s in gives)))
+            spans[name] = max(s[0] for s in own), min(s[1] for s in own)
+    first = min(s[0] for s in (spans or many).values())
+    last = max(s[1] for s in (spans or many).values())
+    start = max(s[0] for s in many.values() if s[0] < first + WINDOW)
+    end = min(s[1] for s in many.values() if s[1] > last - WINDOW)
     start += _to_frame(channels, steps, start, dt)
-    return Grid(start, dt, max(1, int((end - start) / dt + 1e-6) + 1), steps)
+    rows = max(1, int((end - start) / dt + 1e-6) + 1)
+    window = max(1, round(WINDOW / dt))
+
+    def known(low: float, high: float) -> tuple[int, int]:
+        late, early = low >= first + WINDOW, high <= last - WINDOW
+        begin = -int(-((low - start) / dt - 1e-6) // window) * window if late else 0
+        return min(begin, rows), max(min(int((high - start) / dt + 1e-6) + 1, rows), 0) if early else rows
+
+    of_each = {name: known(*s) for name, s in (many | spans).items()}
+    return Grid(start, dt, rows, steps, {name: s for name, s in of_each.items() if s != (0, rows)})
 
 
 def on_raster(
@@ -114,6 +173,7 @@ def _columns(channels: Mapping[str, Channel], grid: Grid, t: Array) -> tuple[dic
     had = taken(channels, when, 0.5 * dt)
     fresh, missing = np.ones(len(t), dtype=bool), np.zeros(len(t), dtype=bool)
     columns = {}
+    row = np.rint(t / dt)
     for name, c in channels.items():
         if len(c.t) < 2:
             columns[name] = np.full(len(t), c.values[0] if len(c.t) else np.nan)
@@ -144,6 +204,9 @@ def _columns(channels: Mapping[str, Channel], grid: Grid, t: Array) -> tuple[dic
             columns[name] = np.interp(when, c.t, c.values)
         i = np.clip(np.searchsorted(c.t, when), 1, len(c.t) - 1)
         away = np.minimum(np.abs(c.t[i] - when), np.abs(when - c.t[i - 1]))
+        if name in grid.known:  # a gap is between samples; before the first and after the last there is none
+            low, behind = grid.rows_of(name)
+            away[(row < low) | (row >= behind)] = 0.0
         fresh &= away < 1.5 * max(step, dt)  # one or two rows are bridged, more are a gap
         missing |= away > 0.75 * max(step, dt)
     return {name: no_smaller(v) for name, v in columns.items()}, fresh, missing

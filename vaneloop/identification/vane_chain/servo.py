@@ -37,15 +37,7 @@ def servo_stage(driven: Driven) -> Stage:
     at_limit = np.convolve(np.abs(c["i_cmd"]) >= 0.9e3 * cal.scalars.current_limit, np.ones(5), "same") > 0.5
     near = no_gap_in_window(t, ~at_limit) & ~(np.convolve(c["missing"], np.ones(9), "same") > 0.5)
     stage = Stage(
-        "servo",
-        outputs,
-        ("mA",),
-        parameters,
-        effects,
-        simulate,
-        t,
-        np.where(run & near, c["i_cmd"], np.nan)[None],
-        window=WINDOW,
+        "servo", outputs, ("mA",), parameters, effects, simulate, t, driven.measured(run & near), window=WINDOW
     )
     stage.lost = hidden[:, None]
     stage.made = Made(servo_stage, driven)

@@ -21,7 +21,9 @@ from vaneloop.identification.user_models.hysteresis_regressors import lagged
 from vaneloop.identification.user_models.motion import smoothed
 from vaneloop.identification.user_models.simulation import Placed
 
-__all__ = ["Driven", "Made", "excerpts"]
+__all__ = ["SAMPLED_OF", "Driven", "Made", "excerpts"]
+
+SAMPLED_OF = "sampled "  # and an output's name: a column that is 1 where the output was sampled; without it, everywhere
 
 
 class Driven(NamedTuple):
@@ -55,6 +57,15 @@ class Driven(NamedTuple):
     def at(self, rows: Array | slice, columns: dict[str, Array], run: Array) -> Driven:
         """Some of the rows, with their ``columns``, and which of them count."""
         return self._replace(t=self.t[rows], columns=columns, run=run, part_of=(self, rows))
+
+    def measured(self, rows: Array) -> Array:
+        """The outputs at the ``rows`` that count, as far as they were sampled there: float64[outputs, samples]."""
+        return np.array([np.where(rows & self.sampled(o), self.columns[o], np.nan) for o in self.outputs])
+
+    def sampled(self, name: str) -> Array:
+        """At which rows an output was sampled, bool[samples]."""
+        there = self.columns.get(SAMPLED_OF + name)
+        return np.ones(len(self.t), dtype=bool) if there is None else there > 0.0
 
     @property
     def curved(self) -> bool:

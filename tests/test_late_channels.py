@@ -1,0 +1,142 @@
+"""A channel that begins late or ends early shortens the subsystems that use it, and no other."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hil.logs import Channel, Log, read_log, write_log
+from tests.conftest import ROOT
+from vaneloop.base.vanes import VANES
+from vaneloop.cli.main import main
+from vaneloop.identification import Record, System, unknown
+from vaneloop.identification.user_models.data import Data
+from vaneloop.identification.vane_chain.chain import Chain, build_chain
+from vaneloop.identification.vane_chain.resample import OF_SUBSYSTEM, grid_of
+from vaneloop.verbs import long
+from vaneloop.verbs.machine import Machine
+from vaneloop.verbs.parts import read_record
+
+SECONDS = 40.0
+CUT = ("n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "p_s", "t_oil", "vigv", "vgv1", "state")
+
+
+@cache
+def a_log() -> Log:
+    return read_log(ROOT / "examples" / "hidden_effect.parquet")[:SECONDS]
+
+
+@cache
+def whole() -> Chain:
+    return build_chain(a_log())
+
+
+def between(log: Log, name: str, low: float, high: float) -> Log:
+    return replace(log, channels={k: c[low:high] if k == name else c for k, c in log.channels.items()})
+
+
+def used(stage: str) -> set[str]:
+    of = OF_SUBSYSTEM[stage]
+    return {*of.needs, *of.takes, *of.gives, "state"}
+
+
+@pytest.mark.parametrize("name", CUT)
+def test_a_channel_shortens_only_what_uses_it(name: str) -> None:
+    rng = np.random.default_rng(len(name))
+    log = between(a_log(), name, rng.uniform(0.0, 20.0), rng.uniform(26.0, SECONDS))
+    channel = log.channels[name]
+    chain = build_chain(log)
+    assert {s.name for s in whole().stages if name not in used(s.name)} <= {s.name for s in chain.stages}
+    for stage in chain.stages:
+        before = whole().stage(stage.name)
+        counted = stage.t[np.isfinite(stage.measured).any(axis=0)] + chain.start
+        if name not in used(stage.name):
+            assert np.array_equal(stage.t + chain.start, before.t + whole().start)
+            if not {name} & {"x_dem", "i_cmd", "x_lvdt"}:  # which refine others where they are there
+                assert np.array_equal(stage.measured, before.measured, equal_nan=True)
+        elif name in VANES:  # the other vanes are measured as ever
+            k = stage.outputs.index(name)
+            there = stage.t[np.isfinite(stage.measured[k])] + chain.start
+            assert channel.t[0] <= there.min() and there.max() < channel.t[-1] + 1e-6
+            assert np.array_equal(np.delete(stage.measured, k, 0), np.delete(before.measured, k, 0), equal_nan=True)
+        else:
+            assert channel.t[0] <= counted.min() and counted.max() < channel.t[-1] + 1e-6
+            assert len(stage.t) * 0.01 > channel.t[-1] - channel.t[0] - 2.1  # whole windows of 1 s
+    cut = channel.t[0] > 2.0 or channel.t[-1] < SECONDS - 2.0
+    assert not cut or any(n.startswith(name) for n in chain.notes)
+
+
+def test_channels_without_a_time_in_common_leave_their_subsystem_alone() -> None:
+    log = a_log()
+    for v in machine_vanes():
+        log = between(log, v, 30.0, SECONDS)
+    chain = build_chain(between(log, "x_lvdt", 0.0, 25.0))
+    assert {s.name for s in chain.stages} == {"demand", "servo", "engine", "actuator"}
+    assert "no time in common" in chain.not_observed["linkage"]
+
+
+def machine_vanes() -> tuple[str, ...]:
+    return Machine().plant.vanes
+
+
+def test_a_late_vane_logger_cuts_the_linkage_alone_in_a_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = a_log()
+    for v in machine_vanes():
+        log = between(log, v, 25.0, SECONDS)
+    write_log(tmp_path / "late.parquet", log.channels)
+    write_log(tmp_path / "whole.parquet", a_log().channels)
+    said: list[dict[str, Any]] = []
+    for file in ("whole", "late"):
+        out = tmp_path / f"{file}.json"
+        main(["compare", str(tmp_path / f"{file}.parquet"), "--json", str(out), "--quiet"])
+        said.append(json.loads(out.read_text()))
+    samples = [{s["stage"]: s["samples"] for s in one["stages"]} for one in said]
+    assert {k: n for k, n in samples[0].items() if k != "linkage"} == {
+        k: n for k, n in samples[1].items() if k != "linkage"
+    }
+    assert 900 < samples[1]["linkage"] <= 1500
+    assert "vigv begins at 25 s: linkage not judged before it" in said[1]["notes"]
+
+
+def test_an_excerpt_of_a_long_log_is_cut_likewise() -> None:
+    log = between(a_log(), "i_cmd", 12.0, SECONDS)
+    grid = grid_of(log)
+    stages_of = Machine().stages_of
+    chain = stages_of(log, grid, [(0, 2_000), (2_500, 4_000)])
+    t = {s.name: s.t for s in chain.stages}
+    assert np.array_equal(t["engine"], np.r_[0:2_000, 2_500:4_000] * 0.01)
+    assert np.array_equal(t["actuator"], np.r_[1_200:2_000, 2_500:4_000] * 0.01)
+    held = long.Whole(log, grid, lambda *p, **few: stages_of(log, grid, *p, **few), (0,))
+    fits = [(s.name, [s.neutral()], s.floor, 1.0) for s in chain.stages if s.name == "actuator"]
+    sums = long.held_against(replace(chain, whole=held), fits, workers=1).sums["actuator"]
+    counted = np.isfinite(build_chain(log).stage("actuator").measured).sum()
+    assert sums.samples.sum() == pytest.approx(counted, abs=300)
+
+
+SYSTEM = System(
+    "lag", "simulate", lambda x, u, p: p.gain * u.u - x.x, outputs={"x": "V"}, inputs={"u": "V"}, states={"x": "V"},
+    parameters=[unknown("gain", 1.0, "1/s")],
+)  # fmt: skip
+
+
+@given(late=st.integers(0, 300), early=st.integers(0, 300))
+def test_nothing_outside_a_drivers_samples_drives_a_users_model(late: int, early: int) -> None:
+    t = np.arange(1_000) * 0.01
+    u, x = np.sin(t), np.sin(t - 0.1)
+    channels = {"u": Channel(t[late : 1_000 - early], u[late : 1_000 - early], unit="V"), "x": Channel(t, x, unit="V")}
+    record, notes = read_record(Log("a", channels, signals={"u": "V", "x": "V"}), SYSTEM)
+    assert t[late] - 0.016 < record.t[0] <= t[late] and t[-1 - early] <= record.t[-1] < t[-1 - early] + 0.016
+    assert bool(notes) == (late > 1 or early > 1)
+    gaps = np.where((t < t[late]) | (t > t[-1 - early]), np.nan, u)
+    data = Data(SYSTEM, [Record("a", t, {"u": gaps, "x": x})])
+    assert np.array_equal(data.u[0][0], u[late : 1_000 - early]) and data.times[0][0] == pytest.approx(t[late])
