@@ -13,7 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import vaneloop
 from hil.logs import Channel, Log, read_log, write_log
+from hil.logs.notes import Note
 from tests.conftest import ROOT
 from vaneloop.base.vanes import VANES
 from vaneloop.cli.main import main
@@ -26,7 +28,8 @@ from vaneloop.verbs.machine import Machine
 from vaneloop.verbs.parts import read_record
 
 SECONDS = 40.0
-CUT = ("n_dem", "n_r", "x_dem", "x_lvdt", "i_cmd", "p_s", "t_oil", "vigv", "vgv1", "state")
+CUT = ("x_dem", "t_oil", "vgv1")
+MORE_CUT = ("n_dem", "n_r", "x_lvdt", "i_cmd", "p_s", "vigv", "state")  # the same, in `make test-all`
 
 
 @cache
@@ -48,7 +51,7 @@ def used(stage: str) -> set[str]:
     return {*of.needs, *of.takes, *of.gives, "state"}
 
 
-@pytest.mark.parametrize("name", CUT)
+@pytest.mark.parametrize("name", [*CUT, *(pytest.param(name, marks=pytest.mark.slow) for name in MORE_CUT)])
 def test_a_channel_shortens_only_what_uses_it(name: str) -> None:
     rng = np.random.default_rng(len(name))
     log = between(a_log(), name, rng.uniform(0.0, 20.0), rng.uniform(26.0, SECONDS))
@@ -87,25 +90,50 @@ def machine_vanes() -> tuple[str, ...]:
     return Machine().plant.vanes
 
 
-def test_a_late_vane_logger_cuts_the_linkage_alone_in_a_command(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log = a_log()
+def test_a_late_vane_logger_cuts_the_linkage_alone_and_commands_count_what_was_done(tmp_path: Path) -> None:
+    log, said = a_log(), []
     for v in machine_vanes():
         log = between(log, v, 25.0, SECONDS)
-    write_log(tmp_path / "late.parquet", log.channels)
-    write_log(tmp_path / "whole.parquet", a_log().channels)
-    said: list[dict[str, Any]] = []
+    for file, channels in (("late", log.channels), ("whole", a_log().channels)):
+        write_log(tmp_path / f"{file}.csv", channels)
+    lines = (tmp_path / "late.csv").read_text().split("\n")
+    lines[299] += ",1"
+    (tmp_path / "late.csv").write_text("\n".join(lines))
     for file in ("whole", "late"):
-        out = tmp_path / f"{file}.json"
-        main(["compare", str(tmp_path / f"{file}.parquet"), "--json", str(out), "--quiet"])
-        said.append(json.loads(out.read_text()))
-    samples = [{s["stage"]: s["samples"] for s in one["stages"]} for one in said]
-    assert {k: n for k, n in samples[0].items() if k != "linkage"} == {
-        k: n for k, n in samples[1].items() if k != "linkage"
-    }
-    assert 900 < samples[1]["linkage"] <= 1500
-    assert "vigv begins at 25 s: linkage not judged before it" in said[1]["notes"]
+        words = [
+            str(tmp_path / f"{file}.csv"),
+            "--json",
+            str(tmp_path / "j"),
+            "--report",
+            str(tmp_path / "p"),
+            "--quiet",
+        ]
+        main(["compare", *words])
+        said.append(json.loads((tmp_path / "j").read_text()))
+    samples = [{(s["stage"], s["signal"]): s["samples"] for s in one["stages"]} for one in said]
+    for (stage, signal), n in samples[0].items():
+        late = samples[1][stage, signal]
+        assert 900 < late <= 1500 if stage == "linkage" else n - 110 <= late <= n  # a row less: a window of 1 s
+    assert said[0]["notes"] == said[0]["done"] == []
+    cut = "vigv begins at 25 s: linkage not judged before it"
+    assert [(d["kind"], d["of"], d["count"], d["rows"]) for d in said[1]["done"]] == [
+        ("left out", "rows", 1, [300]), ("cut", "vigv", 2500, []),
+    ]  # fmt: skip
+    assert said[1]["notes"] == [d["said"] for d in said[1]["done"]] and said[1]["notes"][1] == cut
+    page = (tmp_path / "p").read_text()
+    assert "What reading did to the log" in page and cut in page
+
+
+@pytest.mark.parametrize("verb", [vaneloop.locate, vaneloop.replay])
+def test_answers_count_what_was_done(verb: Any) -> None:
+    note = Note("x: 3 samples are NaN: left out", "left out", "x_lvdt", 3, [4, 5, 9])
+    log = replace(a_log()[["n_dem", "n_r"]], notes=[note, "plain"])
+    answer = verb(log)
+    assert answer.to_dict()["done"] == [
+        {"kind": "left out", "of": "x_lvdt", "count": 3, "rows": [4, 5, 9], "said": str(note)}
+    ]
+    table = str(answer.page().parts[-1])
+    assert all(f">{cell}</td>" in table for cell in ("left out", "x_lvdt", "3", "4, 5, 9", str(note)))
 
 
 def test_an_excerpt_of_a_long_log_is_cut_likewise() -> None:

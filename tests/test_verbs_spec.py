@@ -491,7 +491,7 @@ def test_a_law_as_json_has_33_places() -> None:
 
 def answer(verdict: str, laws: Sequence[Any] = (), **more: Any) -> Any:
     """An answer of ``learn``."""
-    diagnosed: Any = SimpleNamespace(effects=["valve_lag"])
+    diagnosed: Any = SimpleNamespace(effects=["valve_lag"], diagnosis=SimpleNamespace(notes=[]))
     outcome = Outcome(verdict, nearest=["near"], why="why", notes=["note"])
     return learn.Learned(diagnosed, outcome, list(laws), log="a.csv", **more)
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from hil.logs.dbc import Message, load_dbc
 from hil.logs.frames import Frames
+from hil.logs.notes import Note
 from hil.logs.signals import cut_signal, encode, pgn, select
 from hil.logs.source import Channel, LogError, Options, Series, names_held
 from hil.logs.transport import put_together
@@ -83,7 +84,7 @@ class Bus:
         if missing and not rows.size:
             self._silent[key] = self._silent[str(branches[0].name)] = f"all {missing} frames say not available"
         elif missing:
-            self.notes.append(f"{key}: {missing} frames say not available: left out")
+            self.notes.append(Note(f"{key}: {missing} frames say not available: left out", "left out", key, missing))
         return Series(frames.t[rows], values, str(branches[0].unit or ""), framed=True)
 
     def carried(self, key: str) -> tuple[Message, list[Any], Frames, np.ndarray]:

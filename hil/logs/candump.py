@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hil.logs.frames import EXTENDED, Frames
+from hil.logs.notes import Note
 from hil.logs.source import LogError, read_bytes
 from hil.logs.text_lines import Part, join_parts, match_lines
 from vaneloop.base.files import whole
@@ -60,7 +61,9 @@ def read_candump(path: Path) -> Frames:
                 data[right],
             )
         )
-    notes = [f"{bad} lines are not candump lines: left out"] if bad else []
+    notes: list[str] = []
+    if bad:
+        notes.append(Note(f"{bad} lines are not candump lines: left out", "left out", "rows", bad))
     dropped: dict[bytes, int] = {}
     for m in _DROPCOUNT.finditer(raw):
         dropped[m["bus"]] = dropped.get(m["bus"], 0) + int(m["n"])
@@ -68,7 +71,7 @@ def read_candump(path: Path) -> Frames:
         f"the logger dropped {n:,} frames of {bus.decode('ascii', 'replace')} (DROPCOUNT)" for bus, n in dropped.items()
     ]
     if special:
-        notes.append(f"{special} remote or error frames: left out")
+        notes.append(Note(f"{special} remote or error frames: left out", "left out", "frames", special))
     if not parts and (what := next((what for kind, what in _NO_SECONDS if kind.search(raw)), "")):
         raise LogError(f"{path}: {what}; allowed: seconds (candump -l, or -ta on the console)")
     return join_parts(path, parts, "candump", "(1735329625.329586) can0 17C#0000000010000021", notes)

@@ -14,7 +14,7 @@ from pyarrow import csv as arrow
 
 from hil.logs.arrow import arrow_table
 from hil.logs.dates import OddRow, date_notes, from_dates
-from hil.logs.layout import Layout, in_points, layout_of, line_at, opening, units_row
+from hil.logs.layout import Layout, in_points, layout_of, line_at, opening, rows_of, units_row
 from hil.logs.notes import MOST_ROWS, Note
 from hil.logs.plausible import FEW, RUN
 from hil.logs.source import ABSENT, Channel, LogError, Options, Source, is_absent, numbers, read_bytes
@@ -27,6 +27,7 @@ __all__ = ["open_csv", "open_text", "write_csv", "write_lvm", "write_msl"]
 _NO_SAMPLE = ["NA", "N/A", "null", "None", "-"]
 _BLOCK = 1 << 23  # bytes read at once; no row may be longer
 _INK = re.compile(rb"\S")
+_WORD = re.compile(rb"[b-dg-hj-mo-zB-DG-HJ-MO-Z_]")  # of a word, and neither of a number, nan nor inf
 _END = "\x1e\x1a"  # stands behind the last row, where none can be
 # a day, and the midnight that table programs put behind it
 _DAY = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}(?:[ T]0?0:00(?::00(?:[.,]0+)?)?)?")
@@ -98,7 +99,8 @@ def _day_beside(layout: Layout, time: str) -> str:
     index = layout.keys.index(time)
 
     def first_of(k: int) -> str:
-        return next((row[k] for row in layout.sample if len(row) > k and row[k] not in ("", *_NO_SAMPLE)), "")
+        rows = rows_of(layout.sample, layout.separator)
+        return next((row[k] for row in rows if len(row) > k and row[k] not in ("", *_NO_SAMPLE)), "")
 
     if not _CLOCK.fullmatch(first_of(index)):
         return ""
@@ -114,8 +116,9 @@ def _parts(path: Path, raw: bytes, layout: Layout, time: str) -> tuple[bytes, tu
     """
     head = raw[layout.head.at : layout.head.behind].strip(b"\r\n")
     begins = head.split(layout.separator.encode(), 1)[0] + layout.separator.encode()
-    if len(begins) < 2 or raw.find(head, layout.at) < 0:  # another header has no numbers, and is met by that
-        return raw, (0,)
+    word = _WORD.search(head)  # a byte is found in much less time than a line
+    if len(begins) < 2 or (word and raw.find(word[0], layout.at) < 0) or raw.find(head, layout.at) < 0:
+        return raw, (0,)  # another header has no numbers, and is met by that
     out, parts, kept, at = [], [0], layout.at, layout.at - 1
     row, counted = layout.first, layout.at
     empty = layout.separator.encode() * (len(layout.keys) - 1) + b"\n"
@@ -161,7 +164,7 @@ class _Csv:
         if _INK.search(self.raw, self.at) is None:
             return np.empty(0)
         if self.ready is None:
-            if self.raw.count(b'"', self.at) % 2:
+            if self.raw.find(b'"', self.at) >= 0 and self.raw.count(b'"', self.at) % 2:
                 self._closed()
             try:
                 table = self._read(self.wanted, pa.float64())

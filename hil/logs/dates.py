@@ -95,11 +95,12 @@ def from_dates(text: Any) -> Dates | OddRow | None:
 
 def date_notes(found: Dates, first: int) -> list[str]:
     """Notes on dates in a column whose first row is called ``first``."""
+    note = Note(found.note, "converted", "time", len(found.t))
     if found.back < 0:
-        return [found.note]
+        return [note]
     row = first + found.back
     said = f"time: falls back by an hour at row {row}, at the end of summer time: the hour is taken out from there on"
-    return [found.note, Note(said, "converted", "time", len(found.t) - found.back, [row])]
+    return [note, Note(said, "converted", "time", len(found.t) - found.back, [row])]
 
 
 def _summer_ends(us: np.ndarray) -> int:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hil.logs import plausible
+from hil.logs.notes import MOST_ROWS, Note
 from hil.logs.source import LogError
 
 __all__ = ["DISORDER_S", "EXTENDED", "Frames", "frames_in_order", "in_order"]
@@ -67,9 +68,10 @@ def in_order(name: str, t: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np
     if back[worst] > DISORDER_S and (wrong := plausible.out_of_order(t, DISORDER_S)) is not None:
         first = int(np.argmax(wrong))
         what = f"{int(np.count_nonzero(wrong)):,} of {t.size:,} frames"
-        notes.append(
+        said = (
             f"time: {what} have a wrong time stamp (first frame {first + 1}: {t[first]:.9g} s from the first): left out"
         )
+        notes.append(Note(said, "left out", "frames", np.count_nonzero(wrong), np.flatnonzero(wrong)[:MOST_ROWS] + 1))
         rows = np.flatnonzero(~wrong)
         return t, rows[in_order(name, t[rows], notes)[1]]
     if back[worst] > DISORDER_S:

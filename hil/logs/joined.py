@@ -19,7 +19,14 @@ STRAY = 0.01  # share of corners that may stand in other rows
 TELLING = 0.25  # share of true samples with a corner, from which on the channel tells by itself
 UNIFORM = 0.05  # of the step, by which times may be off
 DECIMALS = 9
+DIGITS_OF = 150  # values of one size, whose last digit is looked for
 LOOKED_AT = 1500  # rows of a part of a long channel
+GLANCE = 120  # rows of it that tell most channels apart
+MOST_CORNERS = 0.6  # share of rows: where lines join samples, half of them at most are corners
+
+_LEAST = 1e-9  # of the largest value: the last digit of a channel that has none
+_TENS = 10.0 ** np.arange(DECIMALS)[:, None]
+_NEAR = 1e-6 * np.maximum(1.0, 1e-3 * _TENS)  # of a multiple, by which a number may be off
 
 
 class Joined(NamedTuple):
@@ -30,53 +37,72 @@ class Joined(NamedTuple):
     sure: bool
 
 
-def joined(t: np.ndarray, values: np.ndarray) -> Joined | None:
+def joined(t: np.ndarray, values: np.ndarray, fewest: int = 0) -> Joined | None:
     """The true samples of a channel whose others are straight lines between them; None where all may be true.
 
     A command whose corners stand at round times looks the same, so a channel that seldom bends is not ``sure``.
 
-    t  s, increasing; only a channel with a step of its own is looked at
+    t       s, increasing; only a channel with a step of its own is looked at
+    fewest  corners of a channel that is looked at
     """
     if t.size < 3 * FEWEST:
+        return None
+    bends = _bends(values)
+    corners = np.count_nonzero(bends)
+    if SLOWEST ** -float(corners) > CHANCE or not fewest <= corners <= MOST_CORNERS * values.size:
         return None
     step = float(np.median(np.diff(t)))
     row = np.rint((t - t[0]) / step).astype(np.int64)
     if np.mean(np.abs(t - t[0] - row * step) > UNIFORM * step) > STRAY:
         return None
     even = (row[2:] - row[:-2] == 2) & (row[1:-1] - row[:-2] == 1)
-    bend = np.abs(values[2:] - 2.0 * values[1:-1] + values[:-2])
-    digit = _last_digit(values)
-    corners = row[1:-1][even & (bend > 2.01 * np.maximum(np.maximum(digit[2:], digit[1:-1]), digit[:-2]))]
-    if corners.size > 0.75 * np.count_nonzero(even):
-        return None
+    at = row[1:-1][even & bends]
     for every in range(SLOWEST, 1, -1):
-        if every ** -float(corners.size) > CHANCE:
+        if every ** -float(at.size) > CHANCE:
             continue
-        share = np.bincount(corners % every, minlength=every) / corners.size
+        share = np.bincount(at % every, minlength=every) / at.size
         first = int(np.argmax(share))
         if share[first] >= 1.0 - STRAY:
-            sure = corners.size >= FEWEST and corners.size * every >= TELLING * row[-1]
+            sure = at.size >= FEWEST and at.size * every >= TELLING * row[-1]
             return Joined(every, first, sure)
     return None
 
 
 def seems_joined(t: np.ndarray, values: np.ndarray) -> bool:
-    """Whether the channel is surely joined at its start, in its middle or at its end: a long one is looked at there."""
-    parts = (slice(k, k + LOOKED_AT) for k in sorted({0, max(t.size - LOOKED_AT, 0) // 2, max(t.size - LOOKED_AT, 0)}))
-    return any((j := joined(t[part], values[part])) is not None and j.sure for part in parts)
+    """Whether the channel is surely joined at its start, in its middle or at its end: a long one is looked at there.
+
+    Most channels were sampled in each row, which a few of their rows show.
+    """
+    middle = max(t.size - GLANCE, 0) // 2
+    if np.count_nonzero(_bends(values[middle : middle + GLANCE])) > MOST_CORNERS * GLANCE:
+        return False
+    last = max(t.size - LOOKED_AT, 0)
+    parts = (slice(k, k + LOOKED_AT) for k in sorted({0, last // 2, last}))
+    return any((j := joined(t[part], values[part], FEWEST)) is not None and j.sure for part in parts)
+
+
+def _bends(values: np.ndarray) -> np.ndarray:
+    """Whether the line bends at each value but the first and the last, by more than the last digits of three: bool."""
+    bend = np.abs(values[2:] - 2.0 * values[1:-1] + values[:-2])
+    some = bend > 2.0 * _LEAST * np.abs(values).max(initial=0.0)
+    if SLOWEST ** -float(np.count_nonzero(some)) > CHANCE:  # too few to tell anything
+        return some
+    digit = _last_digit(values)
+    return np.asarray(bend > 2.01 * np.maximum(np.maximum(digit[2:], digit[1:-1]), digit[:-2]))
 
 
 def _last_digit(values: np.ndarray) -> np.ndarray:
     """For each value the decimal step of which it and those of its size are multiples, as text has them; 1e-9 of the
     largest where there is none.
     """
-    size = np.floor(np.log10(np.maximum(np.abs(values), 1e-12))).astype(np.int64)
-    out = np.full(values.size, 1e-9 * np.abs(values).max(initial=0.0))
+    size = np.floor(np.log10(np.maximum(np.abs(values), 1e-12)))
+    out = np.full(values.size, _LEAST * np.abs(values).max(initial=0.0))
     for s in np.unique(size):
-        some = values[size == s]
-        some = some[:: max(1, some.size // 500)]
-        for d in range(DECIMALS):
-            if np.mean(np.abs(some * 10.0**d - np.rint(some * 10.0**d)) < 1e-6 * 10.0 ** max(0, d - 3)) > 0.98:
-                out[size == s] = np.maximum(out[size == s], 10.0**-d)
-                break
+        of = size == s
+        some = values[of]
+        some = some[:: max(1, some.size // DIGITS_OF)]
+        steps = some[None] * _TENS
+        fits = np.count_nonzero(np.abs(steps - np.rint(steps)) < _NEAR, axis=1) > 0.98 * some.size
+        if fits.any():
+            out[of] = np.maximum(out[of], 1.0 / _TENS[int(np.argmax(fits)), 0])
     return out

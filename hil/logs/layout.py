@@ -17,7 +17,7 @@ from hil.logs.source import LogError, Options
 from hil.logs.table import TIME_NAMES, split_unit
 from hil.logs.units import NO_UNIT, factor_of
 
-__all__ = ["SEPARATORS", "Layout", "in_points", "layout_of", "line_at", "opening", "units_row"]
+__all__ = ["SEPARATORS", "Layout", "cells_of", "in_points", "layout_of", "line_at", "opening", "rows_of", "units_row"]
 
 SEPARATORS = ",;\t"
 MOST_COLUMNS = 10_000
@@ -56,7 +56,7 @@ class Layout:
     at, first  byte and row (as an editor counts) of the first row of samples
     comma      decimal comma; ``thousands``: some numbers have signs between their thousands
     opens      how the lines before the header begin
-    sample     cells of the first rows
+    sample     the text of the first rows
     labview    what the header of a LabVIEW measurement file says: word -> cells behind it; empty for other files
     """
 
@@ -72,7 +72,7 @@ class Layout:
     comma: bool
     thousands: bool
     opens: frozenset[str] = frozenset()
-    sample: list[list[str]] = field(default_factory=list, repr=False)
+    sample: bytes = field(default=b"", repr=False)
     labview: dict[str, list[str]] = field(default_factory=dict, repr=False)
 
 
@@ -92,7 +92,7 @@ def _lines(raw: bytes, first: Line, most: int) -> Iterator[Line]:
         line = line_at(raw, line.behind, line.row + 1)
 
 
-def _cells(text: str, separator: str) -> list[str]:
+def cells_of(text: str, separator: str) -> list[str]:
     """Cells of one line; none where it cannot be read by itself."""
     try:
         return [c.strip() for c in next(csv.reader([text], delimiter=separator), [])]
@@ -111,7 +111,9 @@ def layout_of(path: Path, raw: bytes, options: Options) -> Layout:
     if raw.startswith(_LABVIEW, line.at):
         before, line = _behind_labview(raw, line)
         opens = frozenset(opening(b.text) for b in before)
-        said = {c[0]: c[1:] for b in before if len(c := _cells(b.text, "\t")) > 1 or len(c := _cells(b.text, ",")) > 1}
+        said = {
+            c[0]: c[1:] for b in before if len(c := cells_of(b.text, "\t")) > 1 or len(c := cells_of(b.text, ",")) > 1
+        }
     lines = list(_lines(raw, line, LOOKED_AT))
     head, separator = _header(lines, {name for name, signal in options.mapping.items() if signal == "t"})
     opens |= {opening(b.text) for b in lines if b.row < head.row and b.text.strip()}
@@ -127,7 +129,9 @@ def layout_of(path: Path, raw: bytes, options: Options) -> Layout:
     under = under if units else None
     last = under or head
     sample = _sample(raw, last, separator)
-    comma, thousands = _decimal(sample)
+    comma, thousands = False, False
+    if (b'"' if separator == "," else b",") in sample:  # else no cell has a comma
+        comma, thousands = _decimal(rows_of(sample, separator))
     if (sign := said.get("Decimal_Separator", [""])[0]) in (",", "."):
         comma = sign == ","
     if said and not units:
@@ -173,7 +177,9 @@ def _header(lines: list[Line], times: set[str]) -> tuple[Line, str]:
     """
     best: tuple[int, int, Line, str] | None = None
     for separator in SEPARATORS:
-        cells = [_cells(b.text, separator) for b in lines]
+        if not any(separator in b.text for b in lines):
+            continue
+        cells = [cells_of(b.text, separator) for b in lines]
         rows = [i for i, c in enumerate(cells) if len(c) > 1 and any(map(_DATUM.fullmatch, c))]
         if not rows:
             continue
@@ -216,7 +222,7 @@ def _once(headers: list[str]) -> list[str]:
 
 def units_row(text: str, keys: list[str], separator: str) -> dict[str, str]:
     """Key -> unit, where the row under the header holds words, at least half of them units; empty where it does not."""
-    cells = [c.strip("[]()").strip() for c in _cells(text, separator)]
+    cells = [c.strip("[]()").strip() for c in cells_of(text, separator)]
     said = [c for c in cells if c.casefold() not in NO_UNIT]
     known = sum(factor_of(c, "s") is not None for c in said if not _DATUM.fullmatch(c))
     if not known or 2 * known < len(said) or any(map(_DATUM.fullmatch, said)) or len(cells) > len(keys):
@@ -224,17 +230,32 @@ def units_row(text: str, keys: list[str], separator: str) -> dict[str, str]:
     return {k: c for k, c in zip(keys, cells, strict=False) if k and c.casefold() not in NO_UNIT}
 
 
-def _sample(raw: bytes, last: Line, separator: str) -> list[list[str]]:
-    """Cells of the first rows; where no comma is in them that could be a decimal one, those of the first rows with
-    one, too.
-    """
-    if last.behind >= len(raw):
-        return []
-    lines = list(_lines(raw, line_at(raw, last.behind), SAMPLED))
-    far = raw.find(b",", lines[-1].behind)
-    if far >= 0 and separator != "," and not any("," in b.text for b in lines):
-        lines += _lines(raw, line_at(raw, raw.rfind(b"\n", 0, far) + 1), SAMPLED)
-    return [_cells(b.text, separator) for b in lines]
+def _sample(raw: bytes, last: Line, separator: str) -> bytes:
+    """The first rows; where no comma is in them that could be a decimal one, the first rows with one, too."""
+    behind = _behind(raw, last.behind)
+    sample = raw[last.behind : behind]
+    if separator != "," and b"," not in sample and (far := raw.find(b",", behind)) >= 0:
+        first = raw.rfind(b"\n", 0, far) + 1
+        sample += raw[first : _behind(raw, first)]
+    return sample
+
+
+def _behind(raw: bytes, at: int) -> int:
+    """The byte behind some lines, of which the first begins at a byte."""
+    first = at
+    for _ in range(SAMPLED):
+        end = raw.find(b"\n", at)
+        if end < 0:
+            return len(raw)
+        at = end + 1
+        if at - first > _MOST_BYTES:
+            break
+    return at
+
+
+def rows_of(sample: bytes, separator: str) -> Iterator[list[str]]:
+    """The cells of each line."""
+    return (cells_of(text.strip("\r"), separator) for text in sample.decode("utf-8", "replace").split("\n"))
 
 
 def _decimal(rows: Iterable[Iterable[str]]) -> tuple[bool, bool]:

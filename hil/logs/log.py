@@ -543,7 +543,8 @@ def _shift(channels: dict[str, Channel], notes: list[str], era: str) -> None:
     """
     if channels and abs(start := min(float(c.t[0]) for c in channels.values())) > plausible.JUMP:
         since = f"counts from {era}" if start > _EPOCH else "does not count from the start"
-        notes.append(f"time {since}: {start:.6f} s taken for the start of the log")
+        said = f"time {since}: {start:.6f} s taken for the start of the log"
+        notes.append(Note(said, "converted", "time", max(len(c.t) for c in channels.values())))
         shifted = {i: t - start for i, t in {id(c.t): c.t for c in channels.values()}.items()}
         for name, c in channels.items():
             channels[name] = replace(c, t=shifted[id(c.t)])

@@ -13,8 +13,8 @@ MOST_ROWS = 20  # that a note lists; it counts all
 class Note(str):
     """A note on a log: the sentence, and what it says as data.
 
-    kind    what was done: ``left out``, ``cut``, ``converted``, ``guessed``, ``joined``
-    of      what it was done to: a signal, a column, ``rows``, ``time``
+    kind    what was done: ``left out``, ``cut``, ``filled``, ``converted``, ``guessed``, ``joined``
+    of      what it was done to: a signal, a column, a message, ``rows``, ``frames``, ``time``
     number  how many samples or rows
     rows    the first of them, as an editor counts
     """
@@ -28,6 +28,10 @@ class Note(str):
         note = super().__new__(cls, text)
         note.kind, note.of, note.number, note.rows = kind, of, int(number), tuple(int(r) for r in rows)[:MOST_ROWS]
         return note
+
+    def on(self, log: str) -> Note:
+        """The same, which names the log: of several."""
+        return Note(f"{log}: {self}", self.kind, self.of, self.number, self.rows)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Note, (str(self), self.kind, self.of, self.number, self.rows)

@@ -199,7 +199,7 @@ def _units_of_names(out: Opened, signals: Mapping[str, str], guess: bool) -> Non
             taken = f"taken in {unit}, as its name says; --unit {signal}={own} states another"
         else:
             taken = f"taken in {own}, though its name says {unit}; --unit {signal}={unit} takes that"
-        out.notes.append(f"{signal} ({keys[0]}): {taken}")
+        out.notes.append(Note(f"{signal} ({keys[0]}): {taken}", "converted" if guess else "guessed", signal, 1))
 
 
 def _guess_time(path: Path, out: Opened) -> None:
@@ -214,9 +214,8 @@ def _guess_time(path: Path, out: Opened) -> None:
     unit, why = guess_unit(t[np.isfinite(t)])
     if unit:
         out.units["t"] = unit
-        out.notes.append(
-            f"t ({source.time}): guessed to be in {unit} ({why}); --unit t=UNIT states another, --no-guess none"
-        )
+        said = f"t ({source.time}): guessed to be in {unit} ({why}); --unit t=UNIT states another, --no-guess none"
+        out.notes.append(Note(said, "guessed", "t", 1))
 
 
 def sketch(path: Path, out: Opened, signals: Mapping[str, str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:

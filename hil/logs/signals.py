@@ -13,6 +13,7 @@ import numpy as np
 from hil.logs.columns import cut, wrong_crc
 from hil.logs.dbc import Message
 from hil.logs.frames import EXTENDED, Frames
+from hil.logs.notes import MOST_ROWS, Note
 from hil.logs.source import LogError
 
 __all__ = ["crc_table", "cut_raw", "cut_signal", "e2e_crc", "encode", "pgn", "select"]
@@ -55,9 +56,9 @@ def select(frames: Frames, message: Message) -> tuple[np.ndarray, list[str]]:
         # bytes of a transport protocol, of which nothing could be put together, are no signals
         carried = message.layout.length > 8 and int(frames.length[rows].max()) <= 8
         if message.e2e is None and (not carried or message.layout.is_multiplexed()):
-            notes.append(f"{name}: {what}: read as far as they reach")
+            notes.append(Note(f"{name}: {what}: read as far as they reach", "cut", name, short.sum()))
         else:  # a CRC is over all of them
-            notes.append(f"{name}: {what}: left out")
+            notes.append(Note(f"{name}: {what}: left out", "left out", name, short.sum()))
             rows = rows[~short]
     if message.e2e is not None and rows.size:
         if message.layout.length == 8 and frames.data.shape[1] == 8:
@@ -67,7 +68,8 @@ def select(frames: Frames, message: Message) -> tuple[np.ndarray, list[str]]:
             data = frames.data[rows, : message.layout.length]
             wrong = e2e_crc(data, message.e2e) != data[:, 0]
         if wrong.any():
-            notes.append(f"{name}: {int(wrong.sum())} of {rows.size} frames have a wrong CRC: left out")
+            said = f"{name}: {int(wrong.sum())} of {rows.size} frames have a wrong CRC: left out"
+            notes.append(Note(said, "left out", name, wrong.sum(), rows[wrong][:MOST_ROWS] + 1))
             rows = rows[~wrong]
     return rows, notes
 

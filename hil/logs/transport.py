@@ -12,6 +12,7 @@ import numpy as np
 
 from hil.logs.dbc import Message
 from hil.logs.frames import EXTENDED, Frames
+from hil.logs.notes import Note
 from hil.logs.signals import pgn
 
 __all__ = ["put_together"]
@@ -43,9 +44,10 @@ class _Found:
         for name in ("t", "ident", "bus", "data"):
             getattr(self, name).extend(getattr(other, name))
 
-    def note(self, protocol: str) -> str:
+    def note(self, protocol: str) -> Note:
         lost = f"; {self.broken:,} incomplete: left out" if self.broken else ""
-        return f"{protocol}: {len(self.t):,} messages put together from {self.frames:,} frames{lost}"
+        said = f"{protocol}: {len(self.t):,} messages put together from {self.frames:,} frames{lost}"
+        return Note(said, "joined", "frames", self.frames)
 
 
 def put_together(frames: Frames, messages: list[Message]) -> tuple[Frames | None, list[str]]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from hil.logs.notes import Note
 from hil.logs.source import LogError
 from vaneloop.base.signals import UNITS
 
@@ -131,7 +132,9 @@ class Units:
             return values if factor == (1.0, 0.0) else values * factor[0] + factor[1]
         if factor is None and not stated:
             self.unknown[signal] = unit
-            self.notes.append(f"{signal} ({key}): unit {unit!r} is not known, {own} assumed")
+            self.notes.append(
+                Note(f"{signal} ({key}): unit {unit!r} is not known, {own} assumed", "guessed", signal, 1)
+            )
             return values
         allowed = f"{own} or what converts to it"
         if signal in _SPEED:

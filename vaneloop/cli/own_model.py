@@ -109,7 +109,8 @@ def _record(args: argparse.Namespace, system: Any, path: str) -> Any:
 def show(args: argparse.Namespace, by_log: Any) -> None:
     """Print what is to note, each log's error after each step, and the model's own parameters."""
     d = by_log.d
-    for note in by_log.notes:
+    said = {n for logs in (by_log.logs.fitted, by_log.logs.test) if logs for r in logs.data.records for n in r.notes}
+    for note in (n for n in by_log.notes if n not in said):  # those were said when the log was read
         terminal.say(args, f"note: {note}")
     short = short_names(list(next(iter(by_log.steps.values()))))
     rows = []

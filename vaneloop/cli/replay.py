@@ -11,6 +11,7 @@ from typing import Any
 
 from hil.logs import Channel, write_log
 from hil.logs.formats import FORMATS, listed
+from hil.logs.notes import counted
 from hil.loop.lockstep import warm_up
 from hil.native import Program, crash_log
 from hil.native.crash_log import is_crash_log
@@ -123,7 +124,9 @@ def replayed(
         terminal.say(args, f"note: {note}")
     for line in exceeded:
         terminal.say(args, f"differs: {line}")
-    answer = dataclasses.replace(answer, exceeded=exceeded, more=extra or {})
+    notes = list(dict.fromkeys([*said, *result.notes]))
+    more = {**(extra or {}), "notes": notes, "done": counted(notes)}
+    answer = dataclasses.replace(answer, exceeded=exceeded, more=more)
     terminal.write_json(args, answer.to_dict())
     if args.report:
         words = " ".join(["vaneloop replay", args.log, *(a for a in sys.argv[2:] if a != args.log)])

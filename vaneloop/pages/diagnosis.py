@@ -159,7 +159,7 @@ def compare_page(
     if by_log is not None:
         log_by_log(page, by_log)
         curves_by_log(page, by_log)
-        page.notes(by_log.notes)
+    page.notes(by_log.notes if by_log is not None else bound.notes)
     return page
 
 

@@ -340,6 +340,9 @@ def log_page(key: str, answer: dict[str, Any]) -> Page:
             [[p["stage"], p["parameter"], *interval(p["value"], p["low"], p["high"]), p["table"], p["tolerance"],
               p["unit"]] for p in answer["nominal"]],
         )  # fmt: skip
+    done = answer.get("done", [])
     for note in answer.get("notes", []):
-        page.text(note)
+        if note not in [one["said"] for one in done]:
+            page.text(note)
+    page.done(done)
     return page

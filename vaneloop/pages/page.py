@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hil.logs.notes import Note, counted
 from vaneloop.base.files import write
 from vaneloop.base.version import installed_version
 from vaneloop.pages.figures import Figure
@@ -113,11 +114,27 @@ class Page:
         self.parts += [f"<p>{html.escape(p.strip())}</p>" for p in text.split("\n\n") if p.strip()]
 
     def notes(self, notes: Sequence[str]) -> None:
-        """Add what the reader should know, a sentence each, in a section of its own; nothing where there is none."""
+        """Add what the reader should know, a sentence each, and a row for each thing that was done to the log, in a
+        section of its own; nothing where there is none.
+        """
         if notes:
             self.section("Notes")
             for note in notes:
-                self.text(f"{capital(note)}.")
+                if not isinstance(note, Note):
+                    self.text(f"{capital(note)}.")
+            self.done(counted(notes))
+
+    def done(self, done: Sequence[Mapping[str, Any]]) -> None:
+        """Add a table of what was done to a log, as JSON has it (`hil.logs.notes.counted`); nothing where there is
+        nothing.
+        """
+        rows = []
+        for one in done:
+            listed, more = ", ".join(f"{r:,}" for r in one["rows"]), one["count"] - len(one["rows"])
+            listed += f" and {more:,} more" if listed and more > 0 else ""
+            rows.append([one["kind"], one["of"], one["count"] or None, listed, one["said"]])
+        if rows:
+            self.table(["done", "to", "how many", "rows", "in words"], rows, "What reading did to the log.")
 
     def plot(self, figure: Any, caption: str = "", *, half: bool = False) -> None:
         """Add a plot; two ``half`` ones in a row stand side by side where the screen is wide enough."""

@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 DETAIL = 40.0  # s around the worst moment: a whole rise or fall of the engine
 
 
-def replay_page(result: Result, command: str = "", title: str | None = None) -> Page:
-    """The page of one replay."""
+def replay_page(result: Result, command: str = "", title: str | None = None, notes: Sequence[str] = ()) -> Page:
+    """The page of one replay, with ``notes`` on what reading did to the log."""
     measured = [s for s in result.signals if s.reference == "measured"]
     schedule = [s for s in result.signals if s.reference == "schedule"]
     sentence, tone = _replay_verdict(result, measured, schedule)
@@ -96,6 +96,7 @@ def replay_page(result: Result, command: str = "", title: str | None = None) -> 
         for v in vanes:
             if v in result.target:
                 page.plot(against_speed(result, v), half=len(vanes) > 1)
+    page.notes(notes)
     return page
 
 

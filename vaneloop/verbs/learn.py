@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hil.logs.notes import Note, counted
 from plant import write_model
 from plant.model import Learned as Table
 from vaneloop.base.errors import InputError
@@ -108,7 +109,7 @@ class Learned(Answer):
         out: dict[str, object] = {
             "schema": 1, "log": self.log, "verdict": self.verdict, "sentence": self.sentence(),
             "laws": [law_json(law) for law in self.laws], "nearest": self.outcome.nearest, "model": self.path,
-            "named": self.diagnosed.effects, "notes": self.notes,
+            "named": self.diagnosed.effects, "notes": [*self._read, *self.notes], "done": counted(self._read),
         }  # fmt: skip
         out["decisions"] = [one for name, of in self.decisions.items() for one in decisions_json(of, stage=name)]
         out |= {"steps": dict(self.steps)} if self.steps else {}
@@ -154,8 +155,13 @@ class Learned(Answer):
         return {name: (of, chosen) for name, of in self.decisions.items()}
 
     @property
+    def _read(self) -> list[str]:
+        """What reading did to the log."""
+        return [n for n in self.diagnosed.diagnosis.notes if isinstance(n, Note)]
+
+    @property
     def notes(self) -> list[str]:
-        """What the user should know."""
+        """What the user should know of the laws."""
         out = list(self.outcome.notes)
         for law in self.laws:
             if law.untold:
@@ -170,7 +176,9 @@ class Learned(Answer):
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
         said, of = self.sentence(), self.explained
-        return learned_page(self.laws, self.outcome, said, self.notes, self.by_log, command, self.log, of)
+        return learned_page(
+            self.laws, self.outcome, said, [*self._read, *self.notes], self.by_log, command, self.log, of
+        )
 
     def write(self, path: str | Path) -> Path:
         """Write the model with its laws, a file that ``extend --effect`` and ``--model`` take; return its path."""

@@ -77,7 +77,7 @@ def records_of(record: Record, spans: Sequence[Span]) -> list[Record]:
         use = _inside(t, span, record.name)
         columns = {k: v[use] if np.shape(v) == t.shape else v for k, v in _arrays(record).items()}
         begin = record.begin + float(t[use][0] - t[0])
-        out.append(Record(f"{record.name} {span}", t[use], columns, begin))
+        out.append(Record(f"{record.name} {span}", t[use], columns, begin, () if out else record.notes))
     return out or [record]
 
 
@@ -172,7 +172,8 @@ def read_record(log: LogLike, system: System, **reading: Any) -> tuple[Record, l
             v[np.minimum(np.abs(channel.t[i] - t), np.abs(t - channel.t[i - 1])) > 1.5 * step] = np.nan
         columns[c] = v
     name = Path(log if isinstance(log, str | Path) else read.path).name
-    return Record(name, t, columns), [f"{name}: {note}" for note in (*read.notes, *notes)]
+    said = [n.on(name) if isinstance(n, Note) else f"{name}: {n}" for n in (*read.notes, *notes)]
+    return Record(name, t, columns, notes=said), said
 
 
 def _driven(t: Array, drivers: Mapping[str, Channel]) -> tuple[Array, list[Note]]:

@@ -77,7 +77,7 @@ class Replay(Answer):
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
-        return replay_page(self.result, command)
+        return replay_page(self.result, command, notes=self.result.notes)
 
 
 def log_of(log: LogLike, machine: Machine, require: tuple[str, ...] = ("n_dem",)) -> Log:

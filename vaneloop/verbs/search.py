@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, cast
 
 import numpy as np
 
+from hil.logs.notes import counted
 from plant import write_model
 from plant.curve import PLACES
 from plant.effects import EFFECTS
@@ -122,7 +123,7 @@ class Stages(Answer):
         if self.by_log is not None:
             signals = [{**f.json(), "reference": "measured"} for x in self.located for f in x.signals]
             out |= {"signals": signals, **self.by_log.json(), "verdict": self.verdict}
-        return out
+        return out | {"done": counted(cast("list[str]", out["notes"]))}
 
     def rows(self) -> list[Row]:
         """A row for each signal: its error, RMS, and in noise floors."""
@@ -187,7 +188,8 @@ class Diagnosed(Answer):
         """The answer as the JSON of ``vaneloop diagnose``."""
         by_log = self.by_log.json() if self.by_log else {}
         whole = {"whole": self.held.json()} if self.held else {}
-        return diagnosis_json(self.diagnosis, self.log) | by_log | _tested_json(self.tested) | whole
+        out = diagnosis_json(self.diagnosis, self.log) | by_log | _tested_json(self.tested) | whole
+        return out | {"done": counted(out["notes"])}
 
     def rows(self) -> list[Row]:
         """A row for each signal: its held-out error without and with what was found, RMS."""

@@ -101,7 +101,8 @@ class ByLog:
             named[" + ".join(part.effects)] = theta = part.theta
         if final.effects:
             named[" + ".join(final.effects)] = final.theta
-        out = cls(logs, d, {step: logs.figures(theta) for step, theta in named.items()}, notes=list(bound.notes))
+        notes = list(dict.fromkeys([*bound.notes, *(logs.test.notes if logs.test else ())]))
+        out = cls(logs, d, {step: logs.figures(theta) for step, theta in named.items()}, notes=notes)
         out._ablate(judge)
         out._remark(judge)
         m = before or Model()

@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 import scipy
 
+from hil.logs.notes import MOST_ROWS, Note
 from vaneloop.base.sizes import LARGEST, beyond, no_smaller
 from vaneloop.identification.regimes import steady
 from vaneloop.identification.settings import (
@@ -68,6 +69,7 @@ class Data:
         self.notes: list[str] = []
         if not records:
             raise StageError(f"system {system.name!r}: no log")
+        self.notes += [n for r in records for n in r.notes]
         self.records = [self._checked(r) for r in records]
         self.times = [r.t + r.begin for r in self.records]
         self.logs: dict[str, slice] = {}
@@ -117,16 +119,18 @@ class Data:
                     )
                 if bad.any():
                     v = np.interp(t, t[~bad], v[~bad])
-                    self.notes.append(f"{r.name}: {c}: {int(bad.sum())} NaN filled from their neighbours")
+                    filled = f"{r.name}: {c}: {int(bad.sum())} NaN filled from their neighbours"
+                    self.notes.append(Note(filled, "filled", c, bad.sum(), np.flatnonzero(bad)[:MOST_ROWS] + 1))
             columns[c] = v
         drives = [columns[c] for c in (*s.inputs, s.position, s.velocity) if c in columns]
         for c in s.outputs:
             if c in columns and (away := spikes(columns[c], drives)).any():
                 k, n = int(np.argmax(away)), int(away.sum())
                 said = "1 sample left out that jumps" if n == 1 else f"{n} samples left out that jump"
-                self.notes.append(f"{r.name}: {c}: {said} away and back, first {columns[c][k]:.4g} at {t[k]:.6g} s")
+                said = f"{r.name}: {c}: {said} away and back, first {columns[c][k]:.4g} at {t[k]:.6g} s"
+                self.notes.append(Note(said, "left out", c, n, np.flatnonzero(away)[:MOST_ROWS] + 1))
                 columns[c] = np.where(away, np.nan, columns[c])
-        return Record(r.name, t - t[0], columns, begin)
+        return Record(r.name, t - t[0], columns, begin, r.notes)
 
     def _driven(self, r: Record, t: Array) -> tuple[Array, dict[str, Array], float]:
         """Times and channels of a log from where all that drives the model is known to where the first of it ends, and
@@ -140,9 +144,8 @@ class Data:
         lost = len(t) - (use.stop - use.start)
         if lost == 0 or use.stop - use.start < LEAST_SAMPLES:
             return t, dict(r.columns), r.begin
-        self.notes.append(
-            f"{r.name}: {lost} samples at its ends, where what drives the model is not known, do not count"
-        )
+        said = f"{r.name}: {lost} samples at its ends, where what drives the model is not known, do not count"
+        self.notes.append(Note(said, "cut", "time", lost))
         cut = {c: np.asarray(v)[use] if np.shape(v) == t.shape else v for c, v in r.columns.items()}
         return t[use], cut, r.begin + float(t[use.start] - t[0])
 

@@ -45,12 +45,14 @@ class Record:
     """One log: times (s) and channels on them, float64[samples]; NaN where nothing was measured.
 
     begin  s: where it begins in the log that it was cut out of
+    notes  what there is to note on how it was read
     """
 
     name: str
     t: Array
     columns: dict[str, Array]
     begin: float = 0.0
+    notes: Sequence[str] = ()
 
     def __repr__(self) -> str:
         """Name, samples and channels on one line."""

@@ -196,7 +196,7 @@ def _cut(log: Log, grid: Grid, stages: Sequence[str]) -> list[str]:
     """Notes of the time of the log that subsystems have not, and which of their channels is at fault."""
     many = {name: c for name, c in log.channels.items() if len(c.t) > 1}
     edges = min(c.t[0] for c in many.values()), max(c.t[-1] for c in many.values())
-    said: dict[tuple[str, str], list[str]] = {}
+    said: dict[tuple[str, str, int], list[str]] = {}
     notes: dict[str, Note] = {}
     for name in stages:
         of, rows = OF_SUBSYSTEM[name], grid.rows_of(name)
@@ -205,13 +205,14 @@ def _cut(log: Log, grid: Grid, stages: Sequence[str]) -> list[str]:
             if abs(grid.start + rows[k] * grid.dt - edges[k]) > 1.5 * WINDOW:
                 at = [c for c in (*drives, *of.gives) if c in many and grid.rows_of(c)[k] == rows[k]]
                 last = min(at, key=lambda c: (c not in drives, many[c].t[-1] if k else -many[c].t[0]))
-                said.setdefault((f"{last} {words} {many[last].t[-k]:.5g} s", side), []).append(name)
+                lost = round(abs(grid.start + rows[k] * grid.dt - edges[k]) / grid.dt)
+                said.setdefault((f"{last} {words} {many[last].t[-k]:.5g} s", side, lost), []).append(name)
         for c in of.gives:
             if c in many and (grid.rows_of(c)[0] > rows[0] or grid.rows_of(c)[1] < rows[1]):
                 text = f"{c}: measured from {many[c].t[0]:.5g} to {many[c].t[-1]:.5g} s, judged there alone"
-                notes[c] = Note(text, "cut", c)
-    for (text, side), names in said.items():
-        notes[text] = Note(f"{text}: {', '.join(names)} not judged {side} it", "cut", text.split()[0])
+                notes[c] = Note(text, "cut", c, rows[1] - rows[0] - (grid.rows_of(c)[1] - grid.rows_of(c)[0]))
+    for (text, side, lost), names in said.items():
+        notes[text] = Note(f"{text}: {', '.join(names)} not judged {side} it", "cut", text.split()[0], lost)
     return list(notes.values())
 
 
