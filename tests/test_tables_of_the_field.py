@@ -23,7 +23,8 @@ from hil.logs import Channel, Log, LogError, read_log
 from hil.logs.guess import mean_stroke
 from hil.logs.joined import joined
 from hil.logs.notes import Note, counted
-from hil.logs.plausible import judge
+from hil.logs.plausible import judge, too_small
+from hil.logs.scale import proposed_scale
 from hil.logs.survey import survey
 from hil.logs.units import Units, scale_of
 from hil.replay import replay
@@ -319,6 +320,30 @@ def test_a_proposed_gain_and_zero_gives_the_signal_back(
 
 
 @given(
+    st.integers(0, 99), st.sampled_from([0.08, 0.1, 0.4, 5.0]), st.sampled_from([0.0, 20.0]), st.booleans(),
+    st.floats(0.0, 1.0), st.floats(-0.5, 0.5), st.floats(0.95, 1.05),
+)  # fmt: skip
+def test_a_current_of_unknown_scale_follows_the_rate_of_the_stroke(
+    seed: int, gain: float, zero: float, turned: bool, dead: float, null: float, flow: float
+) -> None:
+    """Whatever dead band, null bias and flow gain the valve has, within what a table calls its tolerance."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(1000) * 0.01
+    x = 24.0 + 15.0 * np.sin(2.0 * np.pi * t / rng.uniform(3.0, 6.0))
+    v = np.gradient(x, t)
+    current = (v * 40.0 / 150.0 * flow + dead * np.sign(v) + null + 0.02 * rng.standard_normal(1000)) * (1 - 2 * turned)
+    stroke = {"x_lvdt": (t, x + 0.005 * rng.standard_normal(1000))}
+    found = proposed_scale("i_cmd", (t, (current + zero) / gain), stroke, {})
+    assert found is not None and found[1] == "the rate of x_lvdt"
+    said = scale_of(found[0])
+    assert said[0] == pytest.approx(-gain if turned else gain) and said[1] == "mA"
+    assert (said[2] == 0.0) == (zero == 0.0) and abs(said[2]) == pytest.approx(zero, abs=1.0)
+    right = proposed_scale("i_cmd", (t, current), stroke, {})
+    assert right == (("-mA", "the rate of x_lvdt") if turned else None)
+    assert proposed_scale("i_cmd", (t, rng.standard_normal(1000)), stroke, {}) is None
+
+
+@given(
     st.integers(0, 99), st.sampled_from(["ms", "us", "ns"]), st.sampled_from([1, 2, 5, 10, 20, 50, 100]), st.booleans()
 )
 @settings(max_examples=examples(25), suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -462,3 +487,12 @@ def test_a_shift_of_all_times_changes_nothing_in_a_replay(shift: float, seed: in
     for a, b in zip(here.signals, there.signals, strict=True):
         assert a.samples == b.samples and a.rms == pytest.approx(b.rms, rel=1e-6, abs=1e-9)
     assert max(s.samples for s in here.signals if s.reference == "measured") <= len(here.t) + 1
+
+
+@given(st.integers(-305, -8), st.integers(0, 99))
+def test_a_current_that_moves_nothing_in_any_unit_is_refused(power: int, seed: int) -> None:
+    t = np.arange(500) * 0.01
+    small = 10.0**power * np.random.default_rng(seed).standard_normal(500)
+    stroke = t, 24.0 + 15.0 * np.sin(2.0 * np.pi * t)
+    assert "in A too" in too_small({"i_cmd": (t, small), "x_lvdt": stroke}, set())[0]["i_cmd"]
+    assert not too_small({"i_cmd": (t, small), "x_lvdt": (t, np.full(500, 24.0))}, set())[0]

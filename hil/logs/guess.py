@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from hil.logs.source import LogError, Source
 from hil.logs.units import NO_UNIT, factor_of, scale_of
 from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES
+
+if TYPE_CHECKING:
+    from controller import Calibration
 
 __all__ = [
     "ENOUGH", "Files", "Guess", "Guesses", "contradictions", "design_speed", "guess", "mean_stroke", "planned_angles",
@@ -309,13 +313,22 @@ def contradictions(channels: Mapping[str, _Samples], guessed: set[str], tables: 
     return out
 
 
-def mean_stroke(tables: Files) -> tuple[np.ndarray, np.ndarray]:
-    """Return the controller's mean curve: rotor speed (%), stroke (mm)."""
+def _calibration(tables: Files) -> Calibration:
     from controller import load_calibration  # late: with numba and scipy, which only a guess of these needs
 
     calibration, strokes, angles = (tables.get(n, f"{n}.toml") for n in ("calibration", "stroke_tables", "vane_angles"))
-    table = load_calibration(calibration, strokes, angles=angles).table
+    return load_calibration(calibration, strokes, angles=angles)
+
+
+def mean_stroke(tables: Files) -> tuple[np.ndarray, np.ndarray]:
+    """Return the controller's mean curve: rotor speed (%), stroke (mm)."""
+    table = _calibration(tables).table
     return table[0], 1e3 * table[3]
+
+
+def feed_forward(tables: Files) -> float:
+    """Return the current that the controller gives for a speed of the stroke, mA for each mm/s."""
+    return float(_calibration(tables).scalars.kff)  # A/(m/s)
 
 
 def _off_schedule(stroke: np.ndarray, speed: np.ndarray, tables: Files) -> str:

@@ -144,6 +144,7 @@ def proposed(signal: str, values: np.ndarray) -> str:
 
 # what shows that the machine moves, and how much at least: signal -> own unit
 _MOVES = dict.fromkeys(("n_dem", "n_r", "x_dem", "x_lvdt", *VANES), 10.0)
+_NOTHING = 1e-6  # mA, a nanoampere; no current of a valve is told so finely, and 1 uA if it is in A moves no piston
 _PUSHED = 5.0  # mm of stroke in a second: 1.3 mA at the nominal flow gain
 
 
@@ -156,8 +157,9 @@ def too_small(
     stated    signals whose unit the user named: what they say is taken
 
     Certainly: it stays within what the larger unit's range would be, moves there smoothly by a tenth of it, and the
-    machine cannot do that. A speed never rises smoothly within 1.5 %, nor a stroke within 0.075 mm; angles count while
-    speed or stroke run over a tenth of their range, a current while the stroke is pushed.
+    machine cannot do that; or it is a current too small in the larger unit, too. A speed never rises smoothly within
+    1.5 %, nor a stroke within 0.075 mm; angles count while speed or stroke run over a tenth of their range, a current
+    while the stroke is pushed.
     """
     within = {}
     for s, (_, v) in channels.items():
@@ -183,7 +185,12 @@ def too_small(
         else:
             certain = True
         words = f"all values are within {v.min():.4g} to {v.max():.4g} {r.unit}"
-        if smooth and certain:
+        if s == "i_cmd" and certain and moved < _NOTHING:
+            sure[s] = (
+                f"{words}, which is too little for a machine that moves, in {unit} too; --map NAME={s} names another, "
+                f"--unit {s}=UNIT says what it is in"
+            )
+        elif smooth and certain:
             sure[s] = (
                 f"{words}, which is too little for a machine that moves; --unit {s}={unit}, if it is in {unit} "
                 f"({s}={r.unit}, if not)"
