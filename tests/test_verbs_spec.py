@@ -144,7 +144,7 @@ def system(**more: Any) -> System:
 def test_a_log_of_a_system_is_on_the_raster_of_its_output_with_most_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     slow, fine = np.arange(6) * 0.2, np.arange(21) * 0.05
     gap = fine[(fine < 0.3) | (fine > 0.62)]
-    log = SimpleNamespace(path="logs/r.csv", notes=["read"], channels={
+    log = SimpleNamespace(path="logs/r.csv", notes=["read"], ordered=True, channels={
         "u": Channel(slow, slow, framed=True), "y": Channel(fine, fine**2), "z": Channel(gap, 2.0 * gap),
         "one": Channel(np.array([0.5]), np.array([3.0])),
     })  # fmt: skip
@@ -152,7 +152,8 @@ def test_a_log_of_a_system_is_on_the_raster_of_its_output_with_most_samples(monk
     monkeypatch.setattr(parts, "read_log", lambda path, **how: asked.append((path, how)) or log)
     found, notes = parts.read_record("logs/r.csv", system(), design_rpm=5000.0)
     signals = {"u": "V", "y": "mm", "z": "mm"}
-    assert asked == [("logs/r.csv", {"design_rpm": 5000.0, "require": list(signals), "signals": signals})]
+    how = {"design_rpm": 5000.0, "require": list(signals), "signals": signals, "rows": True}
+    assert asked == [("logs/r.csv", how)]
     assert (found.name, found.begin, notes) == ("r.csv", 0.0, ["r.csv: read"]) and found.t == pytest.approx(fine)
     assert found.columns["u"] == pytest.approx(fine) and found.columns["y"] == pytest.approx(fine**2)
     assert found.columns["one"].tolist() == [3.0] * 21

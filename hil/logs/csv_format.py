@@ -18,7 +18,7 @@ from hil.logs.layout import Layout, in_points, layout_of, line_at, opening, rows
 from hil.logs.notes import MOST_ROWS, Note
 from hil.logs.plausible import FEW, RUN
 from hil.logs.source import ABSENT, Channel, LogError, Options, Source, is_absent, numbers, read_bytes
-from hil.logs.table import Table, Time, split_unit, time_column
+from hil.logs.table import ROW, Table, Time, split_unit, time_column
 from vaneloop.base.files import whole
 from vaneloop.base.signals import UNITS
 
@@ -63,7 +63,7 @@ def open_text(path: Path, raw: bytes, options: Options) -> Source:
             others = [k for k, of in zip(keys, headers, strict=True) if of == h][1:]
             raise LogError(f"{path}: column {h!r} is there more than once (the others: {', '.join(others)})")
     wanted = [k for k in keys if k in known or split_unit(k)[0] in known or k == time.name]
-    day = _day_beside(layout, time.name) if not own else ""
+    day = _day_beside(layout, time.name) if not own and time.name != ROW else ""
     raw, parts = _parts(path, raw, layout, time.name)
     if options.part > len(parts):
         raise LogError(f"{path}: part {options.part}: the log has {len(parts)} part{'s' * (len(parts) > 1)}")

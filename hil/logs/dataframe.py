@@ -7,13 +7,14 @@ that is NaN has no sample: rasters may differ from column to column.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
 from hil.logs.source import ABSENT, LogError, Options, Series, second
-from hil.logs.table import NoTime, Table, Time, split_unit, time_column
+from hil.logs.table import ROW, NoTime, Table, Time, split_unit, time_column
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -111,7 +112,7 @@ def open_frame(frame: DataFrame, path: Path, options: Options) -> Table:
     if time.name == index:
         kind = _kind(own.index)
     else:
-        kind = _kind(own[columns[time.name]])
+        kind = _kind(own[columns[time.name]]) if time.name != ROW else ""
     if kind in ("date", "duration"):  # they are turned into s, whatever is said of them
         units[time.name] = "s"
     framed = {str(c) for c in own.attrs.get("framed") or ()}
@@ -131,10 +132,10 @@ def _time_of_index(own: Any, headers: list[str], options: Options) -> str:
         return ""
     if own.index.name is None and _kind(own.index) == "number":  # rows of numbers: a column that says time goes before
         try:
-            time_column(Path(), headers, options)
+            time_column(Path(), headers, replace(options, rows=False))
             return ""
         except NoTime:
-            return name
+            return "" if options.rows and not own.index.is_monotonic_increasing else name
     return name
 
 

@@ -28,7 +28,7 @@ from hil.logs.opening import Opened, is_ours, open_log, sketch, wanted_design_sp
 from hil.logs.scale import proposed_scale
 from hil.logs.source import ABSENT, Channel, LogError, Options, Series, Source, close_names, find, is_absent
 from hil.logs.stale import stale_rows
-from hil.logs.table import NoTime, split_unit
+from hil.logs.table import ROW, NoTime, split_unit
 from hil.logs.units import UnitError, Units
 from vaneloop.base.errors import meant
 from vaneloop.base.signals import UNITS
@@ -60,6 +60,8 @@ class Log(Channels):
         Unit of each signal that the log may have.
     guesses : tuple
         Which of its names and units are guesses; each has its note, too.
+    ordered : bool
+        Its rows stand in the order of time; not so in a table without one, whose time only counts them.
 
     Examples
     --------
@@ -76,6 +78,7 @@ class Log(Channels):
     notes: list[str] = field(default_factory=list)
     signals: Mapping[str, str] = field(default_factory=lambda: UNITS, repr=False)
     guesses: tuple[Guess, ...] = ()
+    ordered: bool = True
 
     def __post_init__(self) -> None:
         wrong = []
@@ -277,6 +280,7 @@ def read_log(
     tables: Files | None = None,
     part: int = 0,
     name: str = "",
+    rows: bool = False,
 ) -> Log:
     """Read a log of any format, or a ``pandas.DataFrame``, into channels with the product's names and units.
 
@@ -308,6 +312,8 @@ def read_log(
         Which run of a table in which the header stands again, from 1; 0: all where time goes on, else the longest.
     name : str, optional
         What messages call a frame; default: its ``attrs["name"]``.
+    rows : bool, optional
+        Take a table without a time column, too: its rows stand in no order (`Log.ordered`).
 
     Returns
     -------
@@ -341,7 +347,9 @@ def read_log(
     if design_rpm is not None and not (math.isfinite(design_rpm) and design_rpm > 0):
         raise LogError(f"{path}: design speed (={design_rpm:g} rpm) must be finite and above 0")
 
-    log = open_log(path, dbc, mapping, units, design_rpm, signals, guess, mapping_file, tables or {}, part, opened)
+    log = open_log(
+        path, dbc, mapping, units, design_rpm, signals, guess, mapping_file, tables or {}, part, opened, rows
+    )
     source, named, notes, units = log.source, log.named, log.notes, log.units
     if log.guesses.rpm:
         speed, _, words = wanted_design_speed(path, log)
@@ -406,7 +414,8 @@ def read_log(
     notes += [f"{name} ({keys[name]}): {why}" for name, why in perhaps.items()]
     notes += [f"{name}: {why}" for name, why in log.guesses.open.items() if name not in log.guesses.rpm]
     made = tuple(g for g in log.guesses.made.values() if g.signal in channels)
-    return Log(str(path), channels, list(dict.fromkeys([*source.notes, *notes])), signals, made)
+    ordered = getattr(source, "time", "") != ROW
+    return Log(str(path), channels, list(dict.fromkeys([*source.notes, *notes])), signals, made, ordered)
 
 
 def _scale(path: Path, log: Opened, signal: str, t: np.ndarray, values: np.ndarray) -> str:

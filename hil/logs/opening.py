@@ -106,6 +106,7 @@ def open_log(
     tables: Files,
     part: int = 0,
     opened: Callable[[Path, Options], Source] | None = None,
+    rows: bool = False,
 ) -> Opened:
     """Open a log and find its names, guessed where nobody states them; arguments as of `read_log`.
 
@@ -119,7 +120,7 @@ def open_log(
     given = _pairs(path, mapping, signals)
     named = {**bench.names, **given}
     by_name = {name: signal for signal, name in named.items()}
-    options = Options(Path(dbc) if dbc is not None else None, by_name, guess, part)
+    options = Options(Path(dbc) if dbc is not None else None, by_name, guess, part, rows)
     source = (opened or format_at(path).open)(path, options)
     if part and not isinstance(source, Table):
         raise LogError(f"{path}: part {part}: only tables have parts")

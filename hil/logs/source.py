@@ -84,6 +84,7 @@ class Options:
     mapping: Mapping[str, str]
     guess: bool = False  # the time may have a name that says it in other words
     part: int = 0  # which run of a file that holds several, from 1; 0: the reader's choice
+    rows: bool = False  # a table may have no time: its rows stand in no order
 
 
 # A cell without a sample is this NaN; a NaN that the logger wrote is any other. Only the latter is reported.

@@ -14,8 +14,10 @@ from hil.logs.notes import Note
 from hil.logs.source import LogError, Options, Series, close_names, names_held
 from hil.logs.times import guess_column
 
-__all__ = ["TIME_NAMES", "NoTime", "Table", "Time", "split_unit", "time_column"]
+__all__ = ["ROW", "TIME_NAMES", "NoTime", "Table", "Time", "split_unit", "time_column"]
 
+ROW = "number of the row"  # the time of a table without one
+ROW_STEP = 0.01  # s, from row to row of such a table
 TIME_NAMES = ("t", "time", "timestamp", "timestamps", "time_s", "zeit")
 
 
@@ -46,6 +48,8 @@ class Table:
         self.notes: list[str] = list(time.notes)
         self.guessed = time.sure  # how surely the column is the time, where that is guessed; 0 where it is stated
         self._load, self._first, self.time, self._units = load, first, time.name, units
+        if time.name == ROW:
+            self._load = lambda key: ROW_STEP * np.arange(load(headers[0]).size) if key == ROW else load(key)
         self._framed, self._own, self._parts, self._part = framed, own or {}, parts, part
         self.time_unit = units.get(time.name) or split_unit(time.name)[1] or time.unit
         self._t: dict[str, np.ndarray] = {}
@@ -156,6 +160,8 @@ def time_column(path: Path, headers: list[str], options: Options) -> Time:
         return Time(found[0], unit, (note,), sure)
     if found:
         raise NoTime(f"{path}: the time may be {' or '.join(map(repr, found[:4]))}: --map NAME=t takes one", headers)
+    if options.rows:
+        return Time(ROW, "s", ("no time column: rows in no order",))
     text = (
         f"{path}: no time column; looked for {', '.join(TIME_NAMES)} (--map NAME=t names "
         f"another){names_held('column', headers)}"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from hil.logs import Channel, Log, LogError, read_log
+from hil.logs.channels import raster
 from hil.logs.held import held
 from hil.logs.notes import Note
 from hil.logs.units import NO_UNIT, factor_of
@@ -77,7 +78,8 @@ def records_of(record: Record, spans: Sequence[Span]) -> list[Record]:
         use = _inside(t, span, record.name)
         columns = {k: v[use] if np.shape(v) == t.shape else v for k, v in _arrays(record).items()}
         begin = record.begin + float(t[use][0] - t[0])
-        out.append(Record(f"{record.name} {span}", t[use], columns, begin, () if out else record.notes))
+        notes = () if out else record.notes
+        out.append(Record(f"{record.name} {span}", t[use], columns, begin, notes, record.ordered))
     return out or [record]
 
 
@@ -159,7 +161,9 @@ def read_record(log: LogLike, system: System, **reading: Any) -> tuple[Record, l
     if isinstance(log, Log):
         read = _in_units(log, signals, needed)
     else:
-        read = read_log(a_log(log), **reading, require=needed, signals=signals)
+        read = read_log(a_log(log), **reading, require=needed, signals=signals, rows=system.kind == "static")
+    if not read.ordered:
+        return _without_order(read, system, Path(log if isinstance(log, str | Path) else read.path).name)
     reference = max((read.channels[c] for c in system.outputs if c in read.channels), key=lambda c: len(c.t))
     t, notes = _driven(reference.t, {c: read.channels[c] for c in (*motion, *system.inputs) if c in read.channels})
     columns = {}
@@ -174,6 +178,23 @@ def read_record(log: LogLike, system: System, **reading: Any) -> tuple[Record, l
     name = Path(log if isinstance(log, str | Path) else read.path).name
     said = [n.on(name) if isinstance(n, Note) else f"{name}: {n}" for n in (*read.notes, *notes)]
     return Record(name, t, columns, notes=said), said
+
+
+def _without_order(read: Log, system: System, name: str) -> tuple[Record, list[str]]:
+    """The rows of a table without time that have all inputs and an output, in an order that follows from their numbers
+    alone: that of the file says nothing.
+    """
+    t, columns = raster(read.channels)
+    whole = np.all([np.isfinite(columns[c]) for c in system.inputs if c in columns], axis=0)
+    whole &= np.any([np.isfinite(columns[c]) for c in system.outputs if c in columns], axis=0)
+    notes = list(read.notes)
+    if lost := int(np.count_nonzero(~whole)):
+        notes.append(Note(f"rows: {lost} without an input, or without any output: left out", "left out", "rows", lost))
+    columns = {c: v[whole] for c, v in columns.items()}
+    order = np.lexsort([columns[c] for c in sorted(columns)])
+    order = order[np.random.default_rng(0).permutation(len(order))]  # no fold is then of one corner of the inputs
+    said = [n.on(name) if isinstance(n, Note) else f"{name}: {n}" for n in notes]
+    return Record(name, t[: len(order)], {c: v[order] for c, v in columns.items()}, 0.0, said, False), said
 
 
 def _driven(t: Array, drivers: Mapping[str, Channel]) -> tuple[Array, list[Note]]:

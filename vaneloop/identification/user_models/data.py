@@ -43,6 +43,7 @@ from vaneloop.identification.user_models.system import Record, System
 __all__ = ["Data", "noise_of_channel", "noise_of_neighbours", "spikes", "without_order"]
 
 LEAST_SAMPLES = 50  # of a log
+LEAST_POINTS = 12  # of a log of steady points
 
 
 class Data:
@@ -59,6 +60,7 @@ class Data:
     motion_cutoff   Hz, up to which motion is differentiated for it
     window    s, after which the model starts anew from the measured states; None: it does not
     notes     what the user should know
+    ordered   rows stand in the order of time
     like      take the cut-off from an earlier one (for test logs)
     """
 
@@ -71,6 +73,7 @@ class Data:
             raise StageError(f"system {system.name!r}: no log")
         self.notes += [n for r in records for n in r.notes]
         self.records = [self._checked(r) for r in records]
+        self.ordered = all(r.ordered for r in self.records)
         self.times = [r.t + r.begin for r in self.records]
         self.logs: dict[str, slice] = {}
         at = 0
@@ -96,8 +99,9 @@ class Data:
                     f"{', '.join(list(r.columns)[:12])}"
                 )
         t = no_smaller(np.asarray(r.t, dtype=float))
-        if t.ndim != 1 or len(t) < LEAST_SAMPLES:
-            raise StageError(f"{r.name}: {t.size} samples; at least {LEAST_SAMPLES} are needed")
+        least = LEAST_POINTS if s.kind == "static" else LEAST_SAMPLES
+        if t.ndim != 1 or len(t) < least:
+            raise StageError(f"{r.name}: {t.size} samples; at least {least} are needed")
         if not np.all(np.isfinite(t)) or np.any(np.diff(t) <= 0):
             raise StageError(f"{r.name}: time must rise from sample to sample")
         if beyond(t).any():
@@ -130,7 +134,7 @@ class Data:
                 said = f"{r.name}: {c}: {said} away and back, first {columns[c][k]:.4g} at {t[k]:.6g} s"
                 self.notes.append(Note(said, "left out", c, n, np.flatnonzero(away)[:MOST_ROWS] + 1))
                 columns[c] = np.where(away, np.nan, columns[c])
-        return Record(r.name, t - t[0], columns, begin, r.notes)
+        return Record(r.name, t - t[0], columns, begin, r.notes, r.ordered)
 
     def _driven(self, r: Record, t: Array) -> tuple[Array, dict[str, Array], float]:
         """Times and channels of a log from where all that drives the model is known to where the first of it ends, and
@@ -284,7 +288,11 @@ class Data:
         for name, y in zip(self.system.outputs, self.measured, strict=True):
             good = y[np.isfinite(y)]
             level = noise_of_channel(good)
-            if self.system.kind == "static" and (u := np.concatenate(self.u, axis=1)).size and without_order(u):
+            if (
+                self.system.kind == "static"
+                and (u := np.concatenate(self.u, axis=1)).size
+                and (not self.ordered or without_order(u))
+            ):
                 level = noise_of_neighbours(u[:, np.isfinite(y)], good)
             if self.cutoff:  # what the low-pass leaves of the noise in the force as it was logged
                 raw = [r.columns[name] for r in self.records]
@@ -296,8 +304,8 @@ class Data:
     def regimes(self) -> tuple[dict[str, Array], dict[str, str]]:
         """Conditions under which the model may fail, and their units."""
         s = self.system
-        out: dict[str, Array] = {"time": self.t}
-        units = {"time": "s"}
+        out: dict[str, Array] = {"time": self.t} if self.ordered else {}
+        units = {"time": "s"} if self.ordered else {}
         u = np.concatenate(self.u, axis=1) if self.u[0].size else np.zeros((0, len(self.t)))
         names = self.in_names
         unit = s.units.get("position", "m")

@@ -42,7 +42,7 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
 
     def add(prefix: str, place: str, name: str, at: int, family: str, size: Size, leave: tuple[str, ...] = ()) -> None:
         for law in LAWS[family].values():
-            if law.name not in leave:
+            if law.name not in leave and (data.ordered or not law.memory):
                 put(f"{prefix}.{law.name}", law, place, at, size, law.constant(size) if law.constant else 0.0)
         for own in s.laws:
             if own.on == family and own.allowed(place, name, by_default="bias" not in leave):

@@ -46,6 +46,7 @@ class Record:
 
     begin  s: where it begins in the log that it was cut out of
     notes  what there is to note on how it was read
+    ordered  rows stand in the order of time; else ``t`` only counts them
     """
 
     name: str
@@ -53,6 +54,7 @@ class Record:
     columns: dict[str, Array]
     begin: float = 0.0
     notes: Sequence[str] = ()
+    ordered: bool = True
 
     def __repr__(self) -> str:
         """Name, samples and channels on one line."""
