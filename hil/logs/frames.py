@@ -71,7 +71,9 @@ def in_order(name: str, t: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np
         said = (
             f"time: {what} have a wrong time stamp (first frame {first + 1}: {t[first]:.9g} s from the first): left out"
         )
-        notes.append(Note(said, "left out", "frames", np.count_nonzero(wrong), np.flatnonzero(wrong)[:MOST_ROWS] + 1))
+        notes.append(
+            Note(said, "left out", "frames", int(np.count_nonzero(wrong)), np.flatnonzero(wrong)[:MOST_ROWS] + 1)
+        )
         rows = np.flatnonzero(~wrong)
         return t, rows[in_order(name, t[rows], notes)[1]]
     if back[worst] > DISORDER_S:

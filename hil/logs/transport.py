@@ -56,7 +56,7 @@ def put_together(frames: Frames, messages: list[Message]) -> tuple[Frames | None
     ``length`` of the result is int64, and its ``data`` as wide as the longest message.
     """
     long = [m for m in messages if m.layout.length > 8]
-    found, notes = _Found(), []
+    found, notes = _Found(), list[str]()
     if any(m.ident & EXTENDED for m in long):
         group = np.where(frames.ident >> 31 == 1, pgn(frames.ident & np.uint32(0x1FFFFFFF)), 0)
         rows = np.flatnonzero((group == _CM) | (group == _DT))

@@ -72,7 +72,7 @@ def split(fit: Parts, test: Parts | LogsLike) -> tuple[list[Span], list[Span], l
 
 def records_of(record: Record, spans: Sequence[Span]) -> list[Record]:
     """Each part of a record as one of its own; without parts, the record."""
-    out = []
+    out: list[Record] = []
     t = np.asarray(record.t, dtype=float)
     for span in spans:
         use = _inside(t, span, record.name)

@@ -142,7 +142,11 @@ class Data:
         """
         s, use = self.system, slice(0, len(t))
         for c in (*s.inputs, s.position, s.velocity):
-            good = np.flatnonzero(np.isfinite(np.asarray(r.columns[c], dtype=float))) if c in r.columns else []
+            good: Array = (
+                np.flatnonzero(np.isfinite(np.asarray(r.columns[c], dtype=float)))
+                if c in r.columns
+                else np.zeros(0, int)
+            )
             if len(good):
                 use = slice(max(use.start, int(good[0])), min(use.stop, int(good[-1]) + 1))
         lost = len(t) - (use.stop - use.start)
