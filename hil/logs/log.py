@@ -401,7 +401,9 @@ def read_log(
             line = f"{path}: {found} {signal}: {asked}; --map NAME={signal} names another{source.has()}"
             raise LogError("; ".join(filter(None, (line, log.unused))))
     _refuse_units(path, wrong)
-    channels = _own_samples(_fresh(_one_run(path, channels, require, notes), notes), notes)
+    ordered = getattr(source, "time", "") != ROW
+    channels = _one_run(path, channels, require, notes)
+    channels = _own_samples(_fresh(channels, notes) if ordered else channels, notes)
     _shift(channels, notes, "1900" if units.get("t") == "day" else "1970")
     ours = {name: (c.t, c.values) for name, c in channels.items() if is_ours(name, signals)}
     sure, perhaps = plausible.too_small(ours, set(units) - set(log.guesses.made))
@@ -414,7 +416,6 @@ def read_log(
     notes += [f"{name} ({keys[name]}): {why}" for name, why in perhaps.items()]
     notes += [f"{name}: {why}" for name, why in log.guesses.open.items() if name not in log.guesses.rpm]
     made = tuple(g for g in log.guesses.made.values() if g.signal in channels)
-    ordered = getattr(source, "time", "") != ROW
     return Log(str(path), channels, list(dict.fromkeys([*source.notes, *notes])), signals, made, ordered)
 
 

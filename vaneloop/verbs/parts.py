@@ -165,7 +165,8 @@ def read_record(log: LogLike, system: System, **reading: Any) -> tuple[Record, l
     if not read.ordered:
         return _without_order(read, system, Path(log if isinstance(log, str | Path) else read.path).name)
     reference = max((read.channels[c] for c in system.outputs if c in read.channels), key=lambda c: len(c.t))
-    t, notes = _driven(reference.t, {c: read.channels[c] for c in (*motion, *system.inputs) if c in read.channels})
+    drivers = (system.position, system.velocity, *system.inputs)
+    t, notes = _driven(reference.t, {c: read.channels[c] for c in drivers if c in read.channels})
     columns = {}
     for c, channel in read.channels.items():
         step = float(np.median(np.diff(channel.t))) if len(channel.t) > 1 else 0.0
