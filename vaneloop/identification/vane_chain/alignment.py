@@ -102,7 +102,8 @@ def late_vanes(stages: Sequence[Stage]) -> list[Late]:
         return []
     if late[0] < 0.0 and "actuator" in of and not _fits(of["actuator"]):
         return []
-    return [Late(stage.outputs, float(late[0]), float(late[1]) / length, middle)]
+    drift = float(late[1]) if abs(late[1]) > 2.0 * LEAST_LATE else 0.0  # less at either end of the log
+    return [Late(stage.outputs, float(late[0]), drift / length, middle)]
 
 
 def _judged(stages: Sequence[Stage]) -> dict[str, Stage]:

@@ -139,7 +139,7 @@ def build_chain(
             if any(BUS.intersection(one.channels) for one in late):
                 present = (*present, *DELAYS)  # a recorder's lateness and theirs look alike
             chain = _build(log, plant, calibration, present, None, (), draws)
-            said += [one.text() for one in late]
+            said += [Note(one.text(), "converted", ", ".join(one.channels)) for one in late]
     chain.notes += said
     return chain
 
