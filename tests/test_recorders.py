@@ -19,6 +19,7 @@ from tests.firmware_on_rig import firmware
 from tests.test_loggers import rows
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
 from vaneloop.identification.vane_chain.current import SLOW_CURRENTS, samples_of
+from vaneloop.identification.vane_chain.linkage import _late_recorder
 from vaneloop.identification.workflow import compare_stages, diagnose
 
 SEED, DURATION = 41, 120.0
@@ -58,6 +59,16 @@ def test_what_a_sample_of_the_current_is():
     line, held = (mean_of(ramp) for mean_of in SLOW_CURRENTS.values())
     assert np.array_equal(line[1:], ramp[1:] - 0.5)
     assert np.array_equal(held[1:], ramp[:-1])
+
+
+def test_one_lag_of_all_vanes_may_be_their_recorder_s():
+    def lags(*sizes: float) -> dict[str, dict[str, dict[str, float]]]:
+        return {"pot_lag": {f"v{k}": {"low": s - 1e-3, "high": s + 1e-3} for k, s in enumerate(sizes)}}
+
+    assert _late_recorder(lags(0.0025, 0.003, 0.0022)) == "a recorder of the vanes that is late"
+    assert not _late_recorder(lags(0.003, 0.008, 0.003))  # one of them is slower
+    assert not _late_recorder(lags(0.003, 0.0, 0.0))
+    assert not _late_recorder(lags(0.003))
 
 
 def test_clocks_of_several_recorders_are_set_right():

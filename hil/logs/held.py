@@ -17,12 +17,12 @@ import numpy as np
 from hil.logs.source import Channel
 from vaneloop.base.vanes import VANES
 
-__all__ = ["ANSWERS", "COMMANDS", "answers", "held", "phase_of_ticks", "taken", "time_on_wire"]
+__all__ = ["ANSWERS", "COMMANDS", "FEW", "answers", "held", "phase_of_ticks", "taken", "time_on_wire"]
 
 COMMANDS = ("n_dem", "n_r")  # what the ECU sends to the controller
 ANSWERS = ("x_dem", "x_lvdt", "i_cmd", *VANES)  # what the controller sends in each of its ticks of 10 ms
 SAME = 1e-6  # s; stamps count in microseconds
-FEW = 10  # samples, with which no raster can be told
+FEW = 10  # samples, with which no raster can be told: a constant that may begin and end anywhere
 # s that a frame takes: 47 bits at 1 Mbit/s are the fastest, 165 at 250 kbit/s (29-bit identifier) the slowest
 QUICKEST, SLOWEST = 40e-6, 0.7e-3
 BURSTS = 0.1  # share of distances between frames that are those of frames back to back, where there are any

@@ -1,7 +1,8 @@
 """Rows that a logger wrote again because nothing new had come: every channel repeats the row before, to the last bit.
 
-A channel with noise in its last digit repeats itself by chance now and then, and seldom often on end. The channel that
-does so least tells how many repeated rows on end are beyond chance.
+A channel with noise in its last digit turns back in every second row, repeats itself by chance now and then, and seldom
+often on end. The noisy channel that does so least tells how many repeated rows on end are beyond chance. Without noise
+a machine at rest looks the same, and nothing is stale.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ __all__ = ["stale_rows"]
 
 CHANCE = 1e-6  # that any row of the log is taken for stale where all were sampled
 FEWEST = 2  # repeated rows on end; a single one may be a clock that ticked twice
+NOISY = 0.3  # share of changes that go back on the one before; white noise: two thirds
 MOST = 0.5  # share of rows; where more repeat, the channels are slower than the rows
 
 
@@ -32,9 +34,18 @@ def stale_rows(columns: Sequence[np.ndarray]) -> np.ndarray:
     first, length = first[long], length[long]
     for begin, many in zip(first, length, strict=True):
         out[begin : begin + many] = True
-    others = repeats[:, ~out[1:]]
-    chance = float((others.sum(axis=1).min() + 1) / (others.shape[1] + 1))
+    others = [repeats[k, ~out[1:]] for k, v in enumerate(columns) if _turns(v[~out]) >= NOISY]
+    if not others:
+        return np.zeros(rows, dtype=bool)
+    chance = float((min(o.sum() for o in others) + 1) / (len(others[0]) + 1))
     for begin, many in zip(first, length, strict=True):
         if chance**many * rows > CHANCE:
             out[begin : begin + many] = False
     return out if out.mean() <= MOST else np.zeros(rows, dtype=bool)
+
+
+def _turns(v: np.ndarray) -> float:
+    """Share of a channel's changes that go back on the one before."""
+    up = np.sign(np.diff(v))
+    up = up[up != 0.0]
+    return float(np.mean(up[1:] != up[:-1])) if len(up) > 10 else 0.0

@@ -305,12 +305,6 @@ EXPLAINED = setting(
     "All effects named in a subsystem must explain this share of the excess over the floor together.",
     "judgement: a name that leaves most of the error is none",
 )
-LATE = setting(
-    0.04,
-    "s",
-    "Channels may stand early or late in the file by so much.",
-    "numerics: recorders that are started together, and their filters; beyond it a channel is another run's",
-)
 LEFT_FLOORS = setting(
     3.0,
     "noise floors",
@@ -1275,6 +1269,19 @@ AT_ONCE = setting(
     "numerics: an integrator does not meet a jump",
 )
 
+LEAST_SAMPLES = setting(
+    50,
+    "samples",
+    "A log of a model of your own has at least so many.",
+    "judgement: a dozen parameters need some for each",
+)
+LEAST_POINTS = setting(
+    12,
+    "points",
+    "A log of steady points has at least so many, which need no neighbours in time.",
+    "judgement: a curve of four numbers, three times over",
+)
+
 # ---- Vane chain -----------------------------------------------------------------------------------------------------
 DESIGN_SAMPLES = setting(
     4000,
@@ -1449,6 +1456,18 @@ SETTLE = setting(
     "s",
     "So much at the start of a log does not count.",
     "physics: filters, lags and backlash forget how they started",
+)
+LATE = setting(
+    0.04,
+    "s",
+    "Channels may stand early or late in the file by so much.",
+    "numerics: recorders that are started together, and their filters; beyond it a channel is another run's",
+)
+MOVES_ALIKE = setting(
+    0.1,
+    "share",
+    "Fewer moved channels may explain so much less of the error than more of them.",
+    "judgement: the plainer of two readings of a recorder",
 )
 
 # A name that stands twice would leave more settings than names: the record cannot be made then.

@@ -16,6 +16,8 @@ from vaneloop.identification.settings import (
     CONDITION_BAND,
     EDGE_PERIODS,
     INPUT_JUMP,
+    LEAST_POINTS,
+    LEAST_SAMPLES,
     LONGEST_SPIKE,
     MOST_PLANES,
     MOVES,
@@ -41,9 +43,6 @@ from vaneloop.identification.user_models.motion import (
 from vaneloop.identification.user_models.system import Record, System
 
 __all__ = ["Data", "noise_of_channel", "noise_of_neighbours", "spikes", "without_order"]
-
-LEAST_SAMPLES = 50  # of a log
-LEAST_POINTS = 12  # of a log of steady points
 
 
 class Data:

@@ -23,7 +23,7 @@ import numpy as np
 from hil.logs import Log
 from plant import chain
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
-from vaneloop.identification.settings import AGREES, EXPLAINED, LATE, RASTER, WINDOW
+from vaneloop.identification.settings import AGREES, EXPLAINED, LATE, MOVES_ALIKE, RASTER, WINDOW
 from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.vane_chain.current import law_of
 from vaneloop.identification.vane_chain.subsystem_data import Made
@@ -32,10 +32,6 @@ __all__ = ["Late", "aligned", "late_in_controller", "late_vanes"]
 
 Both = tuple[Array, Array]  # the mean of a row's ticks, and the last of them
 LEAST_LATE = chain.TICK  # s; the controller does nothing between two ticks
-MOVES_ALIKE = 0.1  # share of what moving channels explains, by which fewer of them may explain less
-FEWEST_WINDOWS = 10  # that tell
-STEPS = 4  # of Gauss and Newton; each leaves a hundredth of an offset that is short against the motion
-SLOPE = 5e-4  # s, by which channels are moved to see what that changes
 
 
 class Late(NamedTuple):
@@ -127,7 +123,7 @@ def _servo(stage: Stage) -> list[Late]:
     width = int(round(WINDOW / RASTER))
     rows = len(t) // width * width
     whole = np.isfinite(stage.measured[0, :rows]).reshape(-1, width).all(axis=1)
-    if whole.sum() < FEWEST_WINDOWS:
+    if not whole.any():
         return []
 
     def centred(values: Array) -> Array:
@@ -183,7 +179,7 @@ def _fit(stage: Stage, moved: Callable[[Array], Stage], terms: int, frame: float
     sizes = np.array([0.05 * stage.parameters[i].tolerance for i in free])
     n = np.maximum(judge.valid.sum(axis=1), 1)
     before = np.sum(judge.errors(theta[None])[0] ** 2, axis=1) / n
-    for _ in range(STEPS):
+    for _ in range(4):  # each leaves a hundredth of an offset that is short against the motion
         at = LeastSquaresProblem(moved(late), floor)
         tries = np.repeat(theta[None], len(free) + 1, axis=0)
         tries[np.arange(1, len(free) + 1), free] += sizes
@@ -191,9 +187,9 @@ def _fit(stage: Stage, moved: Callable[[Array], Stage], terms: int, frame: float
         columns = [(e[k + 1] - e[0]).ravel() / sizes[k] for k in range(len(free))]
         for k in range(terms):
             other = late.copy()
-            other[k] += SLOPE
+            other[k] += 0.5 * LEAST_LATE
             beside = LeastSquaresProblem(moved(other), floor).errors(theta[None])[0]
-            columns.append((beside - e[0]).ravel() / SLOPE)
+            columns.append((beside - e[0]).ravel() / (0.5 * LEAST_LATE))
         scale = np.array([*(stage.parameters[i].tolerance for i in free), *[LATE] * terms])
         a = np.array(columns).T * scale
         prior = np.diag([*[3.0**0.5] * len(free), *[0.0] * terms])

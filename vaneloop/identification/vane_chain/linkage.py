@@ -52,7 +52,7 @@ def linkage_stage(driven: Driven) -> Stage:
         run = run & known
     measured = driven.measured(run)
     stage = Stage("linkage", outputs, ("deg",) * len(outputs), parameters, effects, simulate, t, measured)
-    stage.alike = {"pot_gain": _cross_talk}
+    stage.alike = {"pot_gain": _cross_talk, "pot_lag": _late_recorder}
     ageing, warming = like_time(t, t_oil), like_temperature(t, t_oil)
     stage.twins = {
         "linkage_wear": ("oil temperature", lambda thetas: simulate(thetas, t=warming)),
@@ -79,6 +79,13 @@ def linkage_stage(driven: Driven) -> Stage:
 def _crossed(x: Array) -> Array:
     """Samples from which on the stroke x (mm) has crossed any ring's play: where in it the ring began is forgotten."""
     return np.asarray(np.maximum.accumulate(x) - np.minimum.accumulate(x) > 3.0)
+
+
+def _late_recorder(named: Named) -> str:
+    """One lag of several potentiometers is that of what they have in common."""
+    lags = named["pot_lag"].values()
+    one = len(lags) > 1 and max(p["low"] for p in lags) <= min(p["high"] for p in lags)
+    return "a recorder of the vanes that is late" if one and min(p["low"] for p in lags) > 0.0 else ""
 
 
 def _cross_talk(named: Named) -> str:

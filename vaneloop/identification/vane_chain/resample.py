@@ -13,7 +13,7 @@ import numpy as np
 
 from hil.figures import noise_floor
 from hil.logs import Channel, Log, LogError
-from hil.logs.held import COMMANDS, answers, held, taken
+from hil.logs.held import COMMANDS, FEW, answers, held, taken
 from vaneloop.base.compiled import compiled
 from vaneloop.base.sizes import no_smaller
 from vaneloop.base.vanes import VANES
@@ -39,7 +39,6 @@ __all__ = [
 
 
 CONDITIONS = ("x_lvdt", "n_r", "t_oil", "p_s", "i_cmd")
-FEW = 10  # samples, up to which a channel is a constant that may begin and end anywhere
 
 
 class OfSubsystem(NamedTuple):
