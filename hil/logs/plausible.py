@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vaneloop.base.sizes import SMALLEST
 from vaneloop.base.vanes import VANES
 
 __all__ = [
@@ -186,7 +185,7 @@ def too_small(
         else:
             certain = True
         words = f"all values are within {v.min():.4g} to {v.max():.4g} {r.unit}"
-        if s == "i_cmd" and certain and SMALLEST < moved < _NOTHING:  # a dead sensor does not move at all
+        if s == "i_cmd" and certain and 0.0 < moved < _NOTHING:  # a dead sensor does not move at all
             sure[s] = (
                 f"{words}, which is too little for a machine that moves, in {unit} too; --map NAME={s} names another, "
                 f"--unit {s}=UNIT says what it is in"
