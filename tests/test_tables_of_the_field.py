@@ -309,14 +309,17 @@ def followed(folder: Path, columns: dict[str, Any], heads: dict[str, str]) -> tu
 def test_a_proposed_gain_and_zero_gives_the_signal_back(
     tmp_path: Path, seed: int, gain: float, zero: float, signal: str, turned: bool
 ) -> None:
+    """A gain near 1 is a sensor's own error, which is for the diagnosis: of it only the sign is proposed."""
     columns = run_of(seed)
+    near = abs(gain - 1.0) <= 0.2
     gain = -gain if turned else gain
-    assume(abs(abs(gain) - 1.0) > 0.2 or turned)
+    assume(not near or turned)
     true = columns[signal].copy()
     columns[signal] = (true - zero) / gain
     log, line = followed(tmp_path, columns, {signal: f"{signal} [VRMS]"})
     assert "follows" in line
-    assert np.max(np.abs(log.channels[signal].values - true)) < 0.03 * np.ptp(true) + 0.02
+    own = 0.25 * np.max(np.abs(true)) + 1.25 * abs(zero) if near else 0.0
+    assert np.max(np.abs(log.channels[signal].values - true)) < 0.03 * np.ptp(true) + 0.02 + own
 
 
 @given(
