@@ -496,8 +496,6 @@ def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
 
 def test_a_file_that_never_changes_is_answered_from_memory_and_nothing_else_is() -> None:
     """The same bytes and headers; what is for one browser, may change, or is asked for in part goes to the pages."""
-    import asyncio
-    from concurrent.futures import ThreadPoolExecutor
 
     from vaneloop.web.lasting import Lasting
 
@@ -540,8 +538,6 @@ def test_a_file_that_never_changes_is_answered_from_memory_and_nothing_else_is()
 
 @pytest.mark.slow
 def test_a_worker_takes_the_process_that_is_loaded_and_what_that_does_first_is_told(tmp_path: Path) -> None:
-    import asyncio
-    from concurrent.futures import ThreadPoolExecutor
 
     from vaneloop.web.jobs import LOADING, Spare, Worker
 
@@ -1817,8 +1813,6 @@ def test_the_live_loop_runs_another_machine(tmp_path: Path, monkeypatch: pytest.
 def test_a_controller_of_one_s_own_that_fails_is_told_and_the_page_goes_on(
     tmp_path: Path, gcc: str, monkeypatch: pytest.MonkeyPatch, fault: str, told: str
 ) -> None:
-    import asyncio
-    from concurrent.futures import ThreadPoolExecutor
 
     from tests.native_builds import wrong
     from vaneloop.web.jobs import WorkError

@@ -25,8 +25,12 @@ def stale_rows(columns: Sequence[np.ndarray]) -> np.ndarray:
     out = np.zeros(rows, dtype=bool)
     if rows < 10:
         return out
-    repeats = np.array([v[1:] == v[:-1] for v in columns])
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], repeats.all(axis=0).astype(np.int8), [0]])))
+    same = np.ones(rows - 1, dtype=bool)
+    for v in columns:  # two channels with noise leave nothing to look at
+        same &= v[1:] == v[:-1]
+        if not same.any():
+            return out
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(np.int8), [0]])))
     first, length = edges[::2] + 1, edges[1::2] - edges[::2]
     long = length >= FEWEST
     if not long.any():
@@ -34,7 +38,7 @@ def stale_rows(columns: Sequence[np.ndarray]) -> np.ndarray:
     first, length = first[long], length[long]
     for begin, many in zip(first, length, strict=True):
         out[begin : begin + many] = True
-    others = [repeats[k, ~out[1:]] for k, v in enumerate(columns) if _turns(v[~out]) >= NOISY]
+    others = [(v[1:] == v[:-1])[~out[1:]] for v in columns if _turns(v[~out]) >= NOISY]
     if not others:
         return np.zeros(rows, dtype=bool)
     chance = float((min(o.sum() for o in others) + 1) / (len(others[0]) + 1))

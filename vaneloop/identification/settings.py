@@ -1463,6 +1463,12 @@ LATE = setting(
     "Channels may stand early or late in the file by so much.",
     "numerics: recorders that are started together, and their filters; beyond it a channel is another run's",
 )
+OTHER_CURRENT = setting(
+    0.9,
+    "share",
+    "A logged current is another kind of sample than the mean since the row before where it misfits by this much less.",
+    "judgement: clearly better, while both hold the same noise",
+)
 MOVES_ALIKE = setting(
     0.1,
     "share",

@@ -149,7 +149,8 @@ def _servo(stage: Stage) -> list[Late]:
         j, k = np.unravel_index(int(np.argmin(power)), power.shape)
         return float(power[j, k]), float(late[j]), float(other[k])
 
-    grid, fine, here = np.arange(-10, 11) * 4e-3, np.arange(-8, 9) * 5e-4, np.zeros(1)
+    step = 0.1 * LATE
+    grid, fine, here = step * np.arange(-10, 11), step * np.arange(-8, 9) / 8.0, np.zeros(1)
     as_logged, found = (demands(here), strokes(here)), []
     as_is = min(least(kind, here, here, *as_logged)[0] for kind in (0, 1))
     d, x = demands(grid), strokes(grid)
@@ -177,8 +178,7 @@ def _fit(stage: Stage, moved: Callable[[Array], Stage], terms: int, frame: float
     theta, late = recalibrate(judge).theta, np.zeros(terms)
     free = [i for i, p in enumerate(stage.parameters) if p.tolerance > 0.0]
     sizes = np.array([0.05 * stage.parameters[i].tolerance for i in free])
-    n = np.maximum(judge.valid.sum(axis=1), 1)
-    before = np.sum(judge.errors(theta[None])[0] ** 2, axis=1) / n
+    before = _mean_squares(judge, theta)
     for _ in range(4):  # each leaves a hundredth of an offset that is short against the motion
         at = LeastSquaresProblem(moved(late), floor)
         tries = np.repeat(theta[None], len(free) + 1, axis=0)
@@ -203,9 +203,15 @@ def _fit(stage: Stage, moved: Callable[[Array], Stage], terms: int, frame: float
     offsets = [late]
     if frame:  # what comes in frames stands late by whole ones
         offsets.append(np.round(late / frame) * frame)
-    errors = [np.sum(LeastSquaresProblem(moved(x), floor).errors(theta[None])[0] ** 2, axis=1) / n for x in offsets]
+    errors = [_mean_squares(LeastSquaresProblem(moved(x), floor), theta) for x in offsets]
     k = min(range(len(offsets)), key=lambda k: float(errors[k].sum()))
     return offsets[k], before, errors[k]
+
+
+def _mean_squares(judge: LeastSquaresProblem, theta: Array) -> Array:
+    """Mean squared error of each output, in squared noise floors."""
+    e = judge.errors(theta[None])[0]
+    return np.asarray(np.sum(e * e, axis=1) / np.maximum(judge.valid.sum(axis=1), 1))
 
 
 def _explains(before: Array, after: Array) -> bool:
@@ -232,12 +238,10 @@ def _one(
     t, c = stage.t, stage.made.driven.columns  # type: ignore[attr-defined]
     if _fits(stage):
         return []
-    outputs = {already.get(o, 0.0) for o in stage.outputs}
-    base = outputs.pop()  # what it explains has been moved by this
+    base = already.get(stage.outputs[0], 0.0)  # by which what it explains has been moved
 
     def of(late: Array) -> dict[str, Array]:
-        out = {name: _shifted(t, c[name], float(late[0])) for name in channels if name in c}
-        return out
+        return {name: _shifted(t, c[name], float(late[0])) for name in channels if name in c}
 
     late, before, after = _fit(stage, _moving(stage, of), 1, RASTER)
     if not _explains(before, after) or not allowed(float(late[0])) or abs(late[0]) >= LATE:
@@ -247,5 +251,4 @@ def _one(
 
 def _fits(stage: Stage) -> bool:
     judge = LeastSquaresProblem(stage, np.asarray(stage.floor))
-    e = judge.errors(recalibrate(judge).theta[None])[0]
-    return bool(np.all(np.sum(e**2, axis=1) <= AGREES**2 * judge.valid.sum(axis=1)))
+    return bool(np.all(_mean_squares(judge, recalibrate(judge).theta) <= AGREES**2))

@@ -37,7 +37,15 @@ from plant.effects import CURVES
 from plant.layout import C_OF, CURVE_ROWS, MOST_CURVES
 from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES, same_stages
-from vaneloop.identification.settings import CHAIN_MEMORY, CURRENT_DRAWS, LEAST_FLOOR, RASTER, SETTLE, WINDOW
+from vaneloop.identification.settings import (
+    CHAIN_MEMORY,
+    CURRENT_DRAWS,
+    LEAST_FLOOR,
+    OTHER_CURRENT,
+    RASTER,
+    SETTLE,
+    WINDOW,
+)
 from vaneloop.identification.subsystem import Array, Stage, noise_of
 from vaneloop.identification.vane_chain.actuator import actuator_stage
 from vaneloop.identification.vane_chain.alignment import aligned, late_in_controller, late_vanes
@@ -392,7 +400,7 @@ def _slow_current(driven: Driven) -> str:
     i = driven.columns["i_cmd"]
     misfits = {what: misfit(mean_of(i)) for what, mean_of in SLOW_CURRENTS.items()}
     what = min(misfits, key=lambda k: misfits[k])
-    return what if misfits[what] < 0.9 * misfit(i) else ""
+    return what if misfits[what] < OTHER_CURRENT * misfit(i) else ""
 
 
 def _never_changes(values: Array) -> bool:

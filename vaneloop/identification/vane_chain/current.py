@@ -22,6 +22,7 @@ from vaneloop.identification.settings import (
     CURRENT_DRAWS,
     CURRENT_LAGS,
     FLOW_BENDS,
+    OTHER_CURRENT,
     RASTER,
     SMOOTH_ORDER,
     SMOOTH_ROWS,
@@ -183,7 +184,7 @@ def other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Ca
     mean = law.mean(axis=1)
     others = {SAMPLED: samples_of(law, samples), BEFORE: mean + 0.1 * (np.roll(law[:, -1], 1) - law[:, -1])}
     what = min(others, key=lambda k: misfit(others[k]))
-    if misfit(others[what]) >= 0.9 * misfit(mean):
+    if misfit(others[what]) >= OTHER_CURRENT * misfit(mean):
         return ""
     c["i_cmd"] = c["i_cmd"] + (mean - others[what])
     return what
