@@ -23,9 +23,9 @@ WINDOW_SAMPLES = (64, 2048)  # fewest: a stable mean square; most: bounded work 
 LEVELS, MOST_PARTS = 100, 20  # of a channel that was rounded twice: fewest levels; most small steps in a large one
 MAX_WINDOWS = 600  # a mean of this many windows is known to better than 1 %
 PLATEAU_GROWTH = 1.08  # growth per doubling of the lag below which the noise counts as uncorrelated
-MOTION_GROWTH = (
-    2.1  # noise behind a lag grows at most 1.5-fold per doubling, held samples twofold, smooth motion eightfold
-)
+# Noise behind a lag grows at most 1.5-fold per doubling, held samples twofold, noise behind a filter of the second
+# order 2.8-fold, smooth motion eightfold.
+MOTION_GROWTH, FILTER_GROWTH = 2.1, 3.0
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,8 @@ def noise_floor(t: ArrayLike, values: ArrayLike) -> float:
     3. A sensor's lag correlates its noise, and s_1 is then too small (0.36 of the truth at 1 kHz behind a lag of 5 ms).
        The lag doubles until s_k stops growing: that plateau is the answer. Correlated noise grows at most 1.5-fold per
        doubling, a channel that holds each sample for several rows twofold, motion eightfold: where growth exceeds 2.1
-       motion has taken over, and the last level before it is the answer.
+       motion has taken over, and the last level before it is the answer. Behind a filter of the second order noise
+       grows up to 2.8-fold, and then comes to a plateau.
     4. A quantised channel cannot be known better than q / sqrt(12): the answer is never below it.
 
     Limits: in a log that never dwells and whose raster is too slow for its motion, the answer is an upper bound. Noise
@@ -143,15 +144,18 @@ def noise_floor(t: ArrayLike, values: ArrayLike) -> float:
         return float(q)
     width = windows.shape[1]
     k, level = 1, _level(windows, 1)
+    before_filter = None  # the level, where what follows may be motion as well
     while 12 * k <= width and level > 0.0:
         after = _level(windows, 2 * k)
         growth = after / level
-        if growth > MOTION_GROWTH:
-            break
-        k, level = 2 * k, (0.5 * (level + after) if growth < PLATEAU_GROWTH else after)
         if growth < PLATEAU_GROWTH:
+            return float(max(0.5 * (level + after), q))
+        if growth > MOTION_GROWTH and before_filter is None:
+            before_filter = level
+        if growth > FILTER_GROWTH:
             break
-    return float(max(level, q))
+        k, level = 2 * k, after
+    return float(max(level if before_filter is None else before_filter, q))
 
 
 _noise_floor = noise_floor  # `error_figures` has a parameter of that name

@@ -8,17 +8,20 @@ import functools
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.loggers import Logger, recorded
+from hil.figures import noise_floor
 from hil.logs import Channel, Log
 from hil.logs.stale import stale_rows
 from tests import rig
 from tests.firmware_on_rig import firmware
 from tests.test_loggers import rows
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
-from vaneloop.identification.vane_chain.current import SLOW_CURRENTS, samples_of
+from vaneloop.identification.vane_chain.current import LOW_PASSES, SLOW_CURRENTS, LowPass, samples_of
+from vaneloop.identification.vane_chain.demand import _by_noise, _other_noise
 from vaneloop.identification.vane_chain.linkage import _late_recorder
 from vaneloop.identification.workflow import compare_stages, diagnose
 
@@ -102,3 +105,66 @@ def test_a_current_at_single_ticks_is_no_missing_physics(rate: int):
     log = recorded(fine(), Logger(rate), np.random.default_rng(1))
     said = verdicts(build_chain(Log("ticks", log, [])))
     assert set(said.values()) == {"none"}, said
+
+
+@pytest.mark.parametrize("kind", LOW_PASSES)
+@pytest.mark.parametrize("late", [0.0, 0.0035, -0.002])
+def test_a_low_pass_delays_a_ramp_by_its_delay(kind: str, late: float):
+    ticks = 0.5 * np.arange(3000.0).reshape(300, 10)  # a row of ten ticks of 1 ms
+    out = LowPass(kind, 0.008, late).of(ticks)
+    moved = (ticks - out).ravel()[1000:-1000] / 0.5  # ticks
+    assert moved == pytest.approx(8.0 + 1e3 * late, abs=0.51)  # a mean of whole ticks lies half a tick beside
+    assert np.ptp(moved) < 1e-6
+
+
+def test_a_low_pass_is_said_as_its_data_sheet_says_it():
+    assert LowPass("mean", 0.005).text() == "a mean over 10 ms"
+    assert LowPass("first order", 1.0 / (2.0 * np.pi * 30.0)).text() == "a low-pass of first order of 30 Hz"
+    assert LowPass("second order", 2.0**0.5 / (2.0 * np.pi * 20.0)).text() == "a low-pass of second order of 20 Hz"
+    assert LowPass(late=0.01).text() == ""
+
+
+LOGGERS = {
+    "a mean over 10": Logger(100, window=0.01), "of first order of 30": Logger(100, filter=(1, 30.0)),
+    "of second order of 30": Logger(100, filter=(2, 30.0)),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("said", LOGGERS)
+def test_a_low_pass_before_the_analogue_channels_is_found_and_no_missing_physics(said: str):
+    chain = build_chain(Log("low-pass", recorded(fine(), LOGGERS[said], np.random.default_rng(1)), []))
+    note = next(n for n in chain.notes if "x_dem" in n)
+    kind, size = said.rsplit(" ", 1)
+    assert kind in note
+    assert float(note.split(kind)[1].split()[0]) == pytest.approx(float(size), rel=0.03)
+    figures = [s for s in compare_stages(chain.stages) if s.stage in ("servo", "actuator", "demand")]
+    assert all(s.agrees for s in figures), [(s.signal, s.ratio) for s in figures]
+
+
+def test_noise_of_an_input_that_its_filter_makes_slow_is_in_the_floor():
+    """White noise behind a lag of 0.5 s, most of it where a gain is large, which is not where the log is quiet."""
+    rng, t = np.random.default_rng(0), np.arange(20_000) * 0.01
+    gain = np.where(t % 20.0 < 10.0, 0.1, 1.0)
+
+    def made() -> np.ndarray:
+        return gain * scipy.signal.lfilter([0.02], [1.0, -0.98], rng.standard_normal(len(t)))
+
+    error, draws = made(), np.array([made() for _ in range(4)])
+    whole, seen = float(np.std(error)), noise_floor(t, error)
+    share, beyond = _by_noise(t, error, draws, 0.0)
+    assert seen < 0.4 * whole
+    assert share == pytest.approx(1.0, abs=0.1)
+    assert np.hypot(seen, beyond) == pytest.approx(whole, rel=0.2)
+    less, beyond_less = _by_noise(t, 0.1 * error, draws, 0.0)
+    assert less == pytest.approx(0.01 * (seen / np.mean([noise_floor(t, d) for d in draws])) ** 2)
+    assert beyond_less <= 0.11 * beyond
+    assert _by_noise(t, 0.1 * error, draws, whole)[1] == 0.0  # the floor is never less than that
+    assert _by_noise(t, 9.0 * error, draws, 0.0)[1] < 1.1 * whole  # what else is in the error is no noise of the input
+
+
+def test_what_a_last_digit_hides_is_one_error_as_long_as_it_stands():
+    t, x = np.arange(40_000) * 0.01, 0.05 * np.repeat(np.arange(400.0), 100)
+    stands = _other_noise(t, x, 0).reshape(400, 100).mean(axis=1)  # what else is in it is white
+    assert np.std(stands) == pytest.approx(0.05 / 12.0**0.5, rel=0.1)
+    assert np.abs(np.corrcoef(stands[1:], stands[:-1])[0, 1]) < 0.15

@@ -302,7 +302,7 @@ def test_the_servo_s_law_is_the_firmware_s_loop_tick_by_tick() -> None:
     rate = np.diff(now, prepend=demand[0]) / 1e-3
     e = now - seen.ravel()
     out = np.empty((30, 10))
-    current._loop(demand, seen, kp, ki, kff, out)
+    current._loop(*current._demanded(demand, current.LowPass()), seen, kp, ki, kff, out)
     assert np.allclose(out.ravel(), kp * e + ki * 1e-3 * np.cumsum(e) + kff * rate)
 
 

@@ -2,7 +2,8 @@
 
 Who records the bus, the controller and the vanes with three devices has three clocks and three filters. What that does
 to a log is no physics, and it is worked out before the search looks for any. Only what the machine cannot do counts as
-the recorder's:
+the recorder's, and each subsystem has its own offsets, against the channels that it explains: what comes in frames,
+each of one of the controller's ticks, is never worked out between two of them.
 
 | subsystem | what stands late | why no machine does that |
 |---|---|---|
@@ -15,76 +16,86 @@ the recorder's:
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from hil.logs import Log
 from plant import chain
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
 from vaneloop.identification.settings import AGREES, EXPLAINED, LATE, MOVES_ALIKE, RASTER, WINDOW
 from vaneloop.identification.subsystem import Array, Stage
-from vaneloop.identification.vane_chain.current import law_of
+from vaneloop.identification.vane_chain.current import AS_LOGGED, LOW_PASSES, LowPass, law_of
 from vaneloop.identification.vane_chain.subsystem_data import Made
 
-__all__ = ["Late", "aligned", "late_in_controller", "late_vanes"]
+__all__ = ["Late", "LateIn", "aligned", "demand_of", "late_in_controller", "late_vanes"]
 
 Both = tuple[Array, Array]  # the mean of a row's ticks, and the last of them
+LateIn = Mapping[str, tuple["Late", ...]]  # subsystem -> what stands late in it, against what it explains
+DEMAND = ("x_dem",)
 LEAST_LATE = chain.TICK  # s; the controller does nothing between two ticks
 
 
 class Late(NamedTuple):
     """Channels whose samples stand ``seconds`` late in the file at the middle of the log, and ``drift`` (s/s) more with
     each second; times count from the start of the log's stages.
+
+    passed  of the servo's demand: what all else has passed, which makes the delay or a part of it
     """
 
     channels: tuple[str, ...]
     seconds: float
     drift: float = 0.0
     middle: float = 0.0
+    passed: LowPass = AS_LOGGED
 
     def text(self) -> str:
         """What is said of it."""
         way = "late" if self.seconds >= 0.0 else "early"
         more = f", and {1e6 * self.drift:.3g} us more each second" if self.drift else ""
+        more += f", since all else has passed {self.passed.text()}" if self.passed.kind else ""
         return f"{', '.join(self.channels)}: stand {abs(1e3 * self.seconds):.3g} ms {way} in the file{more}; moved"
 
-    def times(self, t: Array) -> Array:
-        """The true times of samples that the file has at ``t`` (s)."""
-        return np.asarray(t - self.seconds - self.drift * (t - self.middle))
+
+def aligned(t: Array, columns: dict[str, Array], late: Sequence[Late]) -> dict[str, Array]:
+    """The columns of a raster where they belong."""
+    moved = {name: one for one in late for name in one.channels if name in columns}
+    return columns | {
+        name: _shifted(t, columns[name], one.seconds + one.drift * (t - one.middle)) for name, one in moved.items()
+    }
 
 
-def aligned(log: Log, late: Sequence[Late], start: float) -> Log:
-    """The log with its channels where they belong; ``start``: s of its own time, where that of its stages is 0."""
-    channels = dict(log.channels)
-    for one in late:
-        for name in one.channels:
-            if name in channels:
-                c = channels[name]
-                channels[name] = replace(c, t=start + one.times(c.t - start))
-    return replace(log, channels=channels)
+def demand_of(late: Sequence[Late]) -> tuple[LowPass, tuple[Late, ...]]:
+    """What the servo's demand has not passed and its answer has, and what else stands late."""
+    behind = next((one.passed for one in late if one.channels == DEMAND), AS_LOGGED)
+    return behind, tuple(one for one in late if one.channels != DEMAND)
 
 
-def late_in_controller(stages: Sequence[Stage]) -> list[Late]:
-    """Channels of the controller and of the ECU that stand late, as the stages of a log say where they fail."""
+def late_in_controller(stages: Sequence[Stage]) -> LateIn:
+    """Channels of the controller and of the ECU that stand late in each subsystem, as the stages of a log say where
+    they fail.
+    """
     of = _judged(stages)
-    out = _servo(of["servo"]) if "servo" in of else []
-    moved = {name: one.seconds for one in out for name in one.channels}
+    out: dict[str, tuple[Late, ...]] = {}
+    if "servo" in of and (servo := _servo(of["servo"])):
+        stroke = tuple(one for one in servo if one.channels == ("x_lvdt",))
+        out = {"servo": tuple(servo), "actuator": tuple(servo)} | ({"linkage": stroke} if stroke else {})
+    # an answer before its cause is the recorder's only where it has the answer late in the servo as well
+    demand_late = max([0.0, *(one.seconds for one in out.get("servo", ()) if one.channels == DEMAND)])
     if "demand" in of:
-        out += _one(of["demand"], ("n_r",), lambda d: d > 0.0, moved)
-        moved |= {name: one.seconds for one in out for name in one.channels}
-    return out + (_one(of["engine"], ("n_dem",), lambda d: True, moved) if "engine" in of else [])
+        out["demand"] = _one(of["demand"], ("n_r",), lambda d: d > -demand_late - LEAST_LATE * (demand_late > 0.0))
+    if "engine" in of:
+        out["engine"] = _one(of["engine"], ("n_dem",), lambda d: True)
+    return {name: late for name, late in out.items() if late}
 
 
-def late_vanes(stages: Sequence[Stage]) -> list[Late]:
+def late_vanes(stages: Sequence[Stage]) -> LateIn:
     """Whether all vane angles stand late alike, and more and more where their clock is a fast one. They stand early
     only where the actuator fits: a slow LVDT looks alike, but there, too.
     """
     of = _judged(stages)
     stage = of.get("linkage")
     if stage is None or len(stage.outputs) < 2 or _fits(stage):
-        return []
+        return {}
     t, c = stage.t, stage.made.driven.columns  # type: ignore[attr-defined]
     length = max(float(np.ptp(t)), 1.0)
     middle = 0.5 * float(t[0] + t[-1])
@@ -95,11 +106,11 @@ def late_vanes(stages: Sequence[Stage]) -> list[Late]:
 
     late, before, after = _fit(stage, _moving(stage, shifted), 2)
     if not _explains(before, after) or np.any(np.abs(late) >= LATE):
-        return []
+        return {}
     if late[0] < 0.0 and "actuator" in of and not _fits(of["actuator"]):
-        return []
+        return {}
     drift = float(late[1]) if abs(late[1]) > 2.0 * LEAST_LATE else 0.0  # less at either end of the log
-    return [Late(stage.outputs, float(late[0]), drift / length, middle)]
+    return {"linkage": (Late(stage.outputs, float(late[0]), drift / length, middle),)}
 
 
 def _judged(stages: Sequence[Stage]) -> dict[str, Stage]:
@@ -134,17 +145,20 @@ def _servo(stage: Stage) -> list[Late]:
         return centred(ticks.mean(axis=1)), centred(ticks[:, -1])
 
     none, current = np.zeros(len(t)), centred(c["i_cmd"])
+    logged, stroke = {0.0: c["x_lvdt"]}, c["stroke"]
 
-    def demands(late: Array) -> list[tuple[Array, Array]]:
-        return [both(law_of(_shifted(t, c["x_dem"], d), none, cal)) for d in late]
+    def demanded(passed: LowPass) -> Both:
+        return both(law_of(c["x_dem"], none, cal, behind=passed))
 
-    def strokes(late: Array) -> list[tuple[Array, Array]]:
-        logged = {0.0: c["x_lvdt"]}
-        return [both(law_of(none, _shifted(t, c["stroke"], d), cal, logged.get(float(d)))) for d in late]
+    def demands(late: Array) -> list[Both]:
+        return [demanded(LowPass(late=-float(d))) for d in late]
 
-    def least(kind: int, late: Array, other: Array, d: Sequence[Both], x: Sequence[Both]) -> tuple[float, float, float]:
-        left = current[None] - np.array([one[kind] for one in d])
-        own = np.array([one[kind] for one in x])
+    def strokes(late: Array) -> list[Both]:
+        return [both(law_of(none, _shifted(t, stroke, d), cal, logged.get(float(d)))) for d in late]
+
+    def least(last: int, late: Array, other: Array, d: Sequence[Both], x: Sequence[Both]) -> tuple[float, float, float]:
+        left = current[None] - np.array([one[last] for one in d])
+        own = np.array([one[last] for one in x])
         power = np.sum(left**2, axis=1)[:, None] - 2.0 * left @ own.T + np.sum(own**2, axis=1)[None]
         j, k = np.unravel_index(int(np.argmin(power)), power.shape)
         return float(power[j, k]), float(late[j]), float(other[k])
@@ -152,21 +166,45 @@ def _servo(stage: Stage) -> list[Late]:
     step = 0.1 * LATE
     grid, fine, here = step * np.arange(-10, 11), step * np.arange(-8, 9) / 8.0, np.zeros(1)
     as_logged, found = (demands(here), strokes(here)), []
-    as_is = min(least(kind, here, here, *as_logged)[0] for kind in (0, 1))
+    as_is = min(least(last, here, here, *as_logged)[0] for last in (0, 1))
     d, x = demands(grid), strokes(grid)
-    for kind in (0, 1):
-        _, late, _ = least(kind, grid, here, d, as_logged[1])
-        found.append(least(kind, late + fine, here, demands(late + fine), as_logged[1]))
-        _, late, other = least(kind, grid, grid, d, x)
-        found.append(least(kind, late + fine, other + fine, demands(late + fine), strokes(other + fine)))
+    for last in (0, 1):
+        _, late, _ = least(last, grid, here, d, as_logged[1])
+        found.append(least(last, late + fine, here, demands(late + fine), as_logged[1]))
+        _, late, other = least(last, grid, grid, d, x)
+        found.append(least(last, late + fine, other + fine, demands(late + fine), strokes(other + fine)))
     best = min(found)
     noise = float(stage.floor[0]) ** 2 * len(current)  # type: ignore[index]
     if as_is - best[0] < EXPLAINED * max(as_is - noise, 0.0):
         return []
     # the fewer channels have to move, the better
     near = [f for f in found if f[0] - best[0] <= MOVES_ALIKE * (as_is - best[0])]
-    _, late_demand, late_stroke = min(near, key=lambda f: (f[2] != 0.0, f[0]))
-    return [Late((n,), late) for n, late in (("x_dem", late_demand), ("x_lvdt", late_stroke)) if abs(late) > LEAST_LATE]
+    left, late_demand, late_stroke = min(near, key=lambda f: (f[2] != 0.0, f[0]))
+    passed = LowPass(late=-late_demand)
+    if late_demand < -LEAST_LATE:  # all else is late: behind a low-pass, maybe
+        own = current[None] - np.array(strokes(np.array([late_stroke]))[0])
+        tried = [_low_pass(kind, -late_demand, lambda f: own - np.array(demanded(f))) for kind in LOW_PASSES]
+        passed = min(tried, key=lambda x: x[0])[1] if min(tried)[0] < left else passed
+    lates = (Late(DEMAND, -passed.delay - passed.late, passed=passed), Late(("x_lvdt",), late_stroke))
+    return [one for one in lates if abs(one.seconds) > LEAST_LATE]
+
+
+def _low_pass(kind: str, delay: float, errors: Callable[[LowPass], Array]) -> tuple[float, LowPass]:
+    """The low-pass of a kind, and how late it stands besides, that leave least of the ``errors`` (float64[kinds of
+    sample, values]), near this ``delay`` (s): least squares. Returns what is left, squared, and it.
+    """
+    found = []
+    for sample in (0, 1):
+        at, best = np.array([delay, 0.0]), (np.inf, AS_LOGGED)
+        for _ in range(4):
+            e = errors(LowPass(kind, *at))[sample]
+            best = min(best, (float(e @ e), LowPass(kind, *at)))
+            step = 0.2 * LEAST_LATE
+            slopes = [(errors(LowPass(kind, *(at + d)))[sample] - e) / step for d in step * np.eye(2)]
+            at = at - np.linalg.lstsq(np.array(slopes).T, e, rcond=None)[0]
+            at[0] = np.clip(at[0], 0.5 * delay, 2.0 * delay)
+        found.append(best)
+    return min(found)
 
 
 def _fit(stage: Stage, moved: Callable[[Array], Stage], terms: int, frame: float = 0.0) -> tuple[Array, Array, Array]:
@@ -231,22 +269,19 @@ def _moving(stage: Stage, of: Callable[[Array], Mapping[str, Array]]) -> Callabl
     return moved
 
 
-def _one(
-    stage: Stage, channels: tuple[str, ...], allowed: Callable[[float], bool], already: Mapping[str, float]
-) -> list[Late]:
+def _one(stage: Stage, channels: tuple[str, ...], allowed: Callable[[float], bool]) -> tuple[Late, ...]:
     """One offset of ``channels`` that drive a stage against all else in it."""
     t, c = stage.t, stage.made.driven.columns  # type: ignore[attr-defined]
     if _fits(stage):
-        return []
-    base = already.get(stage.outputs[0], 0.0)  # by which what it explains has been moved
+        return ()
 
     def of(late: Array) -> dict[str, Array]:
         return {name: _shifted(t, c[name], float(late[0])) for name in channels if name in c}
 
     late, before, after = _fit(stage, _moving(stage, of), 1, RASTER)
     if not _explains(before, after) or not allowed(float(late[0])) or abs(late[0]) >= LATE:
-        return []
-    return [Late(channels, float(late[0]) + base)]
+        return ()
+    return (Late(channels, float(late[0])),)
 
 
 def _fits(stage: Stage) -> bool:

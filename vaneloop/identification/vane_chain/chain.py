@@ -48,7 +48,14 @@ from vaneloop.identification.settings import (
 )
 from vaneloop.identification.subsystem import Array, Stage, noise_of
 from vaneloop.identification.vane_chain.actuator import actuator_stage
-from vaneloop.identification.vane_chain.alignment import aligned, late_in_controller, late_vanes
+from vaneloop.identification.vane_chain.alignment import (
+    Late,
+    LateIn,
+    aligned,
+    demand_of,
+    late_in_controller,
+    late_vanes,
+)
 from vaneloop.identification.vane_chain.candidates import OF_STROKE, reversals, room_for
 from vaneloop.identification.vane_chain.current import (
     SAMPLED,
@@ -139,17 +146,23 @@ def build_chain(
     draws    of what the log hides from the servo
     """
     chain = _build(log, plant, calibration, present, grid, pieces, draws)
-    said: list[str] = []
+    late: dict[str, tuple[Late, ...]] = {}
     framed = any(c.framed for c in log.channels.values())  # frames are stamped by one clock
     for find in () if pieces or framed else (late_in_controller, late_vanes):
-        if late := find(chain.stages):
-            log = aligned(log, late, chain.start)
-            if any(BUS.intersection(one.channels) for one in late):
-                present = (*present, *DELAYS)  # a recorder's lateness and theirs look alike
-            chain = _build(log, plant, calibration, present, None, (), draws)
-            said += [Note(one.text(), "converted", ", ".join(one.channels)) for one in late]
-    chain.notes += said
+        if found := find(chain.stages):
+            late |= {name: late.get(name, ()) + more for name, more in found.items()}
+            chain = _build(log, plant, calibration, present, grid, (), draws, late)
+    chain.notes += _moved(late)
     return chain
+
+
+def _moved(late: LateIn) -> list[Note]:
+    """Notes of what stands late, each channel against what its subsystems explain."""
+    of: dict[Late, list[str]] = {}
+    for name, all_of in late.items():
+        for one in all_of:
+            of.setdefault(one, []).append(name)
+    return [Note(f"{', '.join(on)}: {one.text()}", "converted", ", ".join(one.channels)) for one, on in of.items()]
 
 
 def _build(
@@ -160,14 +173,16 @@ def _build(
     grid: Grid | None,
     pieces: Sequence[tuple[int, int]],
     draws: int,
+    late: LateIn = {},  # noqa: B006
 ) -> Chain:
-    """`build_chain` with every channel where the file has it."""
+    """`build_chain` with every channel where the file has it, but for what stands ``late`` in a subsystem."""
     machine = plant or build_plant()
     tables = calibration or load_calibration()
     same_stages(geometry=machine.vanes, vane_angles=tables.vanes)
     grid = grid or grid_of(log)
     absent: dict[str, str] = {}
-    together: dict[tuple[tuple[int, int], ...], list[str]] = {}  # subsystems that have the same rows
+    # subsystems that have the same rows, and the same channels late
+    together: dict[tuple[tuple[tuple[int, int], ...], tuple[Late, ...]], list[str]] = {}
     for name, of in OF_SUBSYSTEM.items():
         rows = grid.pieces_of(name, pieces)
         missing = [c for c in of.needs if c not in log.channels]
@@ -179,11 +194,13 @@ def _build(
         elif rows is None:
             absent[name] = f"{', '.join(c for c in (*of.needs, *gives) if c in log.channels)} have no time in common"
         else:
-            together.setdefault(rows, []).append(name)
+            together.setdefault((rows, late.get(name, ())), []).append(name)
     chains, why = [], None
-    for rows, names in together.items() or {tuple(pieces): []}.items():
+    for (rows, moved), names in together.items() or {(tuple(pieces), ()): []}.items():
+        # a recorder's lateness and that of the bus look alike
+        theirs = DELAYS if any(BUS.intersection(one.channels) for one in moved) else ()
         try:
-            chains.append(_chain(log, grid, rows, names, machine, tables, present, draws))
+            chains.append(_chain(log, grid, rows, names, machine, tables, (*present, *theirs), draws, moved))
         except LogError as e:
             why = why or e
             absent |= dict.fromkeys(names, str(e).removeprefix(f"{log.path}: "))
@@ -233,9 +250,10 @@ def _chain(
     tables: Calibration,
     present: tuple[str, ...],
     draws: int,
+    late: Sequence[Late] = (),
 ) -> Chain:
-    """The stages of these ``names``, which have the same rows; a channel that has not all of them is left out, but for
-    what is explained.
+    """The stages of these ``names``, which have the same rows, and the same channels ``late``; a channel that has not
+    all of its rows is left out, but for what is explained.
     """
     cal = flashed(tables, machine)
     theirs = tables.program is not None  # a controller of the user's own: its servo's law is not known
@@ -251,6 +269,8 @@ def _chain(
             f"search for missing physics"
         )
     dt = float(t[1] - t[0])
+    behind, late = demand_of(late)
+    columns = aligned(t, columns, late)
     # after a gap everything is as at the start of a log: what the stages remember must come from the rows behind it
     fresh = ~scipy.ndimage.binary_propagation(~fresh, mask=~fresh | lacking)
     stretch = stretches(fresh)
@@ -299,9 +319,9 @@ def _chain(
         rough = Driven(t, have, machine, cal, (), usable, (), turns=partial(reversals, t, have["x_lvdt"], full))
         smooth = without_noise(t, have, machine, rough.slipping(rough.signals(), machine.p))
     if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
-        if "x_dem" in columns and not theirs:
+        if "x_dem" in columns and not theirs and {"servo", "actuator"} & set(names):
             samples = min(10, max(1, round(dt / grid.steps["i_cmd"])))
-            law, *off = servo_law(t, have, cal, smooth, draws, samples)
+            law, *off = servo_law(t, have, cal, smooth, draws, samples, behind)
             what = other_current(t, have, law, run, cal, samples)
             if what:
                 notes.append(
@@ -310,7 +330,7 @@ def _chain(
                 )
                 columns["i_cmd"] = have["i_cmd"]
                 smooth = without_noise(t, have, machine, rough.slipping(rough.signals(), machine.p))
-                law, *off = servo_law(t, have, cal, smooth, draws, samples)
+                law, *off = servo_law(t, have, cal, smooth, draws, samples, behind)
             sampled = what == SAMPLED
             have["law"], have["law_error"] = law, off[1] if sampled else off[0]
             unknown = off[0][:, 0] - off[1][:, 0] if sampled else None
@@ -364,10 +384,10 @@ def _chain(
             stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
         if (apart := max(round(log.channels[c].apart / dt) for c in needs)) > 1:
             more = np.zeros(len(outputs))
-            own, late = np.arange(0, len(t), 2 * apart), np.minimum(np.arange(len(t)) + apart // 2, len(t) - 1)
+            own, half = np.arange(0, len(t), 2 * apart), np.minimum(np.arange(len(t)) + apart // 2, len(t) - 1)
             slow = [c for c in needs if log.channels[c].apart > 1.5 * dt]
             # what half of the true samples cost, or half the time between two, is more than what the lines do
-            for other in ({c: np.interp(t, t[own], have[c][own]) for c in slow}, {c: have[c][late] for c in slow}):
+            for other in ({c: np.interp(t, t[own], have[c][own]) for c in slow}, {c: have[c][half] for c in slow}):
                 varied = make(driven._replace(columns=have | other))
                 change = stage.run(stage.neutral()[None])[0] - varied.run(varied.neutral()[None])[0]
                 more = np.maximum(more, rms(stage, change))

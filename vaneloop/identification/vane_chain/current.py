@@ -34,21 +34,85 @@ from vaneloop.identification.settings import (
 from vaneloop.identification.subsystem import Array
 
 __all__ = [
-    "BEFORE", "SAMPLED", "SLOW_CURRENTS", "Smooth", "between_rows", "law_of", "other_current", "samples_of",
-    "servo_law", "without_noise",
+    "AS_LOGGED", "BEFORE", "LOW_PASSES", "SAMPLED", "SLOW_CURRENTS", "LowPass", "Smooth", "between_rows", "law_of",
+    "other_current", "samples_of", "servo_law", "without_noise",
 ]  # fmt: skip
 
 SAMPLED = "the current at single ticks"
 BEFORE = "the mean of the ten ticks before the row"
 
 
+class LowPass(NamedTuple):
+    """What a recorder's low-pass does to a channel, beside one that did not pass it.
+
+    kind   of `LOW_PASSES`; "": none
+    delay  s, of slow motions, that the low-pass makes
+    late   s, by which the channel stands late besides; below 0, the other one is late
+    """
+
+    kind: str = ""
+    delay: float = 0.0
+    late: float = 0.0
+
+    def of(self, ticks: Array) -> Array:
+        """The same of values at ticks, of any shape that runs through all of them."""
+        out = LOW_PASSES[self.kind](ticks.ravel(), self.delay / chain.TICK) if self.kind else ticks.ravel()
+        at = np.arange(float(len(out)))
+        return np.interp(at - self.late / chain.TICK, at, out).reshape(ticks.shape)
+
+    def text(self) -> str:
+        """What it is, as its data sheet would say it."""
+        if not self.kind:
+            return ""
+        if self.kind == "mean":
+            return f"a mean over {2e3 * self.delay:.3g} ms"
+        corner = {"first order": 1.0, "second order": 2.0**0.5}[self.kind] / (2.0 * np.pi * self.delay)
+        return f"a low-pass of {self.kind} of {corner:.3g} Hz"
+
+
+AS_LOGGED = LowPass()
+
+
+def _mean_of(x: Array, delay: float) -> Array:
+    """Mean over the 2 ``delay`` ticks before."""
+    width, at = max(2.0 * delay, 1.0), np.arange(len(x) + 1.0)
+    total = np.concatenate([[0.0], np.cumsum(x)])
+    before = np.interp(at[1:] - width, at, total) + x[0] * np.minimum(at[1:] - width, 0.0)
+    return np.asarray((total[1:] - before) / width)
+
+
+def _first_order(x: Array, delay: float) -> Array:
+    share = 0.5 / (delay + 0.5)  # by the bilinear transformation
+    return x[0] + _lagged(0.5 * (x + np.concatenate([x[:1], x[:-1]])) - x[0], 2.0 * share)
+
+
+def _second_order(x: Array, delay: float) -> Array:
+    """A filter of Butterworth of the second order, whose delay is the root of 2 over its corner."""
+    b, a = scipy.signal.butter(2, min(2.0**0.5 / max(delay, 1e-3) / np.pi, 0.99))
+    return x[0] + np.asarray(scipy.signal.lfilter(b, a, x - x[0]))
+
+
+# What a recorder may have before its analogue channels, of a delay in ticks.
+LOW_PASSES: Mapping[str, Callable[[Array, float], Array]] = {
+    "mean": _mean_of, "first order": _first_order, "second order": _second_order
+}  # fmt: skip
+
+
 def servo_law(
-    t: Array, c: dict[str, Array], cal: Calibration, smooth: Smooth, draws: int = CURRENT_DRAWS, samples: int = 1
+    t: Array,
+    c: dict[str, Array],
+    cal: Calibration,
+    smooth: Smooth,
+    draws: int = CURRENT_DRAWS,
+    samples: int = 1,
+    behind: LowPass = AS_LOGGED,
 ) -> tuple[Array, Array, Array]:
     """What the firmware's servo loop makes of logged demand and stroke, but for a constant of its integral.
 
     At the row it has the logged stroke with its noise; the nine ticks before it had other noise, so theirs is taken off
     the stroke.
+
+    behind  what stroke and current have passed, and the demand has not: a filter of both is one of the law
 
     Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; and draws of
     how much their mean, and that of the ticks that `samples_of` gives for ``samples``, are off because not all of
@@ -63,7 +127,7 @@ def servo_law(
     between = stroke - np.interp(when.ravel(), t, smooth.stroke).reshape(when.shape)
     stroke[:, -1] = x
     law = np.empty(when.shape)
-    _loop(x_dem, stroke, *gains, law)
+    _loop(*_demanded(x_dem, behind), stroke, *gains, law)
     # not known: the LVDT's noise in nine ticks, what smoothing leaves at the rows, the way between them, which is known
     # as well as a straight line and a cubic agree, and what the logged demand's last digit hides
     draw, step = np.random.default_rng(0), resolution(x_dem)
@@ -77,42 +141,50 @@ def servo_law(
         ticks *= smooth.noise
         np.subtract(ticks, off, out=off)
         off[:, -1] = 0.0
-        _loop(-step * draw.uniform(-0.5, 0.5, len(t)), off, *gains, ticks)
+        _loop(*_demanded(-step * draw.uniform(-0.5, 0.5, len(t)), behind), off, *gains, ticks)
         of_mean[:, k], of_some[:, k] = ticks.mean(axis=1), samples_of(ticks, samples)
     return law, of_mean, of_some
 
 
-def law_of(x_dem: Array, stroke: Array, cal: Calibration, logged: Array | None = None) -> Array:
+def law_of(
+    x_dem: Array, stroke: Array, cal: Calibration, logged: Array | None = None, behind: LowPass = AS_LOGGED
+) -> Array:
     """The servo loop's current (mA) at the ten ticks up to each row for a demand and a stroke (mm) at the rows, but for
-    a constant of its integral: linear in both. ``logged``: the stroke at the rows with its noise, which it had there.
+    a constant of its integral: linear in both. ``logged``: the stroke at the rows with its noise, which it had there;
+    ``behind``: see `servo_law`.
     """
     ticks, out = np.empty((len(stroke), 10)), np.empty((len(stroke), 10))
     _between(stroke, SplineRates(np.arange(float(len(stroke))))(stroke), ticks)
     if logged is not None:
         ticks[:, -1] = logged
-    _loop(x_dem, ticks, cal.scalars.kp, cal.scalars.ki, cal.scalars.kff, out)
+    _loop(*_demanded(x_dem, behind), ticks, cal.scalars.kp, cal.scalars.ki, cal.scalars.kff, out)
     return out
 
 
-@compiled
-def _loop(demand: Array, stroke: Array, kp: float, ki: float, kff: float, out: Array) -> None:
-    """The servo loop's current at the ten ticks up to each row: its integral runs through all of them.
+def _demanded(x_dem: Array, behind: LowPass) -> tuple[Array, Array]:
+    """Demand and its rate at each tick, float64[rows, 10]: since the row before, nine ticks of the ramp before it, then
+    the first of the new one (docs/controller.md, timing).
+    """
+    before = np.concatenate([x_dem[:1], x_dem[:-1]])
+    two = np.concatenate([x_dem[:1], before[:-1]])
+    rate = np.repeat(((before - two) / RASTER)[:, None], 10, axis=1)
+    rate[:, 9] = (x_dem - before) / RASTER
+    ramp = two[:, None] + (before - two)[:, None] * (np.arange(2, 12) / 10.0)
+    ramp[:, 9] = before + (x_dem - before) / 10.0
+    return (ramp, rate) if behind == AS_LOGGED else (behind.of(ramp), behind.of(rate))
 
-    demand  at each row: ticks since the row before are nine of the ramp before it, then the first of the new one
-            (docs/controller.md, timing)
-    stroke  at each tick, float64[rows, 10]
+
+@compiled
+def _loop(demand: Array, rate: Array, stroke: Array, kp: float, ki: float, kff: float, out: Array) -> None:
+    """The servo loop's current at the ten ticks up to each row, of demand, its rate and stroke at each of them: its
+    integral runs through all of them.
     """
     total = 0.0
-    two = before = demand[0]
     for m in range(len(demand)):
         for i in range(10):
-            ramp, rate = two + (before - two) * ((i + 2) / 10.0), (before - two) / RASTER
-            if i == 9:
-                ramp, rate = before + (demand[m] - before) / 10.0, (demand[m] - before) / RASTER
-            e = ramp - stroke[m, i]
+            e = demand[m, i] - stroke[m, i]
             total += e
-            out[m, i] = kp * e + ki * total * chain.TICK + kff * rate
-        two, before = before, demand[m]
+            out[m, i] = kp * e + ki * total * chain.TICK + kff * rate[m, i]
 
 
 @compiled

@@ -8,11 +8,12 @@ from controller import Calibration, new_inputs, new_outputs, new_state
 from controller.records import SLOW, SLOW_TICK, TICK, Record, as_inputs, as_outputs, as_scalars, as_state
 from controller.schedule import ROW_EXTENSION, ROW_RETRACTION, move_demand, schedule_step
 from controller.trend import trend_step
+from hil.figures import noise_floor, resolution
 from hil.native.call import firmware
 from plant.curve import DEMAND_ADDS
 from plant.effects import ROW
 from vaneloop.base.compiled import compiled, compiled_free
-from vaneloop.identification.settings import APPROACH, DEMAND_SAME, RASTER, WARM_FRAMES
+from vaneloop.identification.settings import APPROACH, CURRENT_DRAWS, DEMAND_SAME, LEAST_FLOOR, RASTER, WARM_FRAMES
 from vaneloop.identification.subsystem import Array, Effect, Parameter, Stage
 from vaneloop.identification.vane_chain.parameters import bends, declared
 from vaneloop.identification.vane_chain.resample import lately, pieces_of
@@ -159,7 +160,41 @@ def demand_stage(driven: Driven) -> Stage:
     at = {e.name: sum(len(f.parameters) for f in effects[:i]) for i, e in enumerate(effects)}
     stage = Stage("demand", outputs, ("mm",), (), effects, simulate, t, measured[None])
     stage.made = Made(demand_stage, driven)
+    if driven.again:
+        return stage
+    as_logged, own = simulate(stage.neutral()[None])[0, 0], []
+    for seed in range(CURRENT_DRAWS):
+        noisy = demand_stage(driven._replace(columns=c | {"n_r": n_r + _other_noise(t, n_r, seed)}, again=True))
+        own.append(np.where(np.isfinite(measured), noisy.run(noisy.neutral()[None])[0, 0] - as_logged, np.nan))
+    share, beyond = _by_noise(t, measured - as_logged, np.array(own), LEAST_FLOOR["demand"])
+    stage.lost, stage.raster_error = np.sqrt(share) * np.array(own)[:, None], np.array([beyond])
     return stage
+
+
+def _other_noise(t: Array, values: Array, seed: int) -> Array:
+    """Noise such as a channel has: white, and what its last digit hides, which is one error as long as it stands."""
+    draw, step, size = np.random.default_rng(seed), resolution(values), noise_floor(t, values)
+    hidden = step * draw.uniform(-0.5, 0.5, len(t))[np.cumsum(np.diff(values, prepend=values[0]) != 0.0)]
+    white = max(size**2 - step**2 / 12.0, 0.0)
+    return np.asarray(hidden + np.sqrt(white if white > 0.05 * size**2 else 0.0) * draw.standard_normal(len(t)))
+
+
+def _by_noise(t: Array, error: Array, draws: Array, least: float) -> tuple[float, float]:
+    """How much of the noise of an input is an error, as a share of its power, and the RMS of what it makes beyond what
+    is seen of it as noise of the error.
+
+    Behind a filter noise is slow, and differs with the gain, so that the quiet parts of a log show little of it. How
+    much of the input's noise is an error is not known, for the controller may have had the same: no more than makes
+    the noise seen in the error.
+
+    draws  what all of it makes, float64[draws, samples]
+    least  what the floor is at least
+    """
+    seen, whole = noise_floor(t, error), float(np.nanmean(draws**2))
+    shown = float(np.mean([noise_floor(t, d) for d in draws]))
+    share = min(1.0, (seen / shown) ** 2) if shown > 0.0 else 0.0
+    slow = share * max(whole - shown**2, 0.0)
+    return share, float(np.sqrt(max(seen**2 + slow - max(seen, least) ** 2, 0.0)))
 
 
 # ---- Stage `demand` of a controller of the user's own: the stroke demand that it makes of logged speeds
