@@ -105,11 +105,11 @@ def outputs(stage: str, p: np.ndarray, kind: str, rng: np.random.Generator, know
     n_r, t_oil, p_s = 60.0 + 5.0 * np.sin(T), 30.0 + T, 21e6 - 1e5 * np.cos(T)
     stroke = 0.024 + 2e-3 * np.sin(3.0 * T)
     if stage == "actuator":
-        out = np.empty((N, LANES))
+        out = np.empty((N, LANES), order="F")
         i = step_currents(4e-3 * np.sin(7.0 * T) + 1e-4 * rng.standard_normal(N), DT, 5)
         actuator_run(i, n_r, p_s, t_oil, DT, p, s, out, stroke, 100, known)
     elif stage == "linkage":
-        out = np.empty((N, 3, LANES))
+        out = np.empty((N, 3, LANES), order="F")
         linkage_run(stroke, n_r, t_oil, T, DT, p, s, out, known)
     elif stage == "engine":
         out = np.empty((N, LANES))

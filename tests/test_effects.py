@@ -200,14 +200,14 @@ def lanes_of(sets, base):
 def actuator_lanes(sets, base, n=SAMPLES):
     p, s = lanes_of(sets, base)
     derive(p, 2e-3, 1e-2)
-    out, c = np.empty((n, len(sets))), {k: v[:n] for k, v in log().items()}
+    out, c = np.empty((n, len(sets)), order="F"), {k: v[:n] for k, v in log().items()}
     actuator_run(step_currents(c["i_cmd"], 1e-2, 5), c["n_r"], c["p_s"], c["t_oil"], 1e-2, p, s, out, c["x_lvdt"], 500)
     return out, s
 
 
 def linkage_lanes(sets, base, n=SAMPLES):
     p, s = lanes_of(sets, base)
-    out, c = np.empty((n, 3, len(sets))), {k: v[:n] for k, v in log().items()}
+    out, c = np.empty((n, 3, len(sets)), order="F"), {k: v[:n] for k, v in log().items()}
     linkage_run(c["x_lvdt"], c["n_r"], c["t_oil"], T[:n], 1e-2, p, s, out)
     return out, s
 

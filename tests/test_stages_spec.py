@@ -122,7 +122,7 @@ def log(n: int = 12) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 def run(p: np.ndarray, window: int = 0, table: str = HYDRAULIC, lvdt: np.ndarray | None = None) -> np.ndarray:
     i, n_r, p_s, t_oil = log()
     s = np.repeat(shipped(table).start(0.024, 60.0), p.shape[1], axis=1)
-    out = np.full((len(n_r), p.shape[1]), np.nan)
+    out = np.full((len(n_r), p.shape[1]), np.nan, order="F")
     actuator_run(i, n_r, p_s, t_oil, 8e-3, p, s, out, lvdt, window)
     return out
 
