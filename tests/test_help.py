@@ -5,10 +5,12 @@ are there or are made by an example before.
 from __future__ import annotations
 
 import importlib
+import json
 import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -140,7 +142,9 @@ NOT_RUN = {
 }
 SMALLER = {"--frames 10000000": "--frames 20000", "--logs 40": "--logs 1 --duration 60",
            "--logs 60": "--logs 1 --duration 60 --seed 3",  # a draw at random takes up to five times as long
-           "--out out/motor.parquet": "--out out/motor.parquet --logs 1 --duration 60"}  # fmt: skip
+           "--out out/motor.parquet": "--out out/motor.parquet --logs 1 --duration 60",
+           "engine-test --": "engine-test --profile short.toml --",  # whole in docs/engine_test.md and the README
+           "strategies --": "strategies --dwell 0.05 --"}  # fmt: skip
 # commands whose examples take long
 LONG = {"strategies", "design", "spatial", "clearance", "experiment", "diagnose", "engine-test"}
 LONG_EXAMPLES = {
@@ -173,6 +177,12 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
     loop = {k: Channel(channels[k].t[::10], channels[k].values[::10]) for k in ("n_dem", "x_lvdt", "vigv")}
     write_log(folder / "LOOP.csv", loop)
     write_log(folder / "BENCH.csv", {k: Channel(c.t[:3000], c.values[:3000]) for k, c in channels.items()})
+    profile = tomllib.loads((ROOT / "tables" / "engine_test.toml").read_text(encoding="utf-8"))
+    short = []
+    for name, table in profile.items():
+        cut = {key: value[:9] if isinstance(value, list) else value for key, value in table.items()}
+        short += [f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in cut.items())]
+    (folder / "short.toml").write_text("\n".join(short), encoding="utf-8")
     with pytest.MonkeyPatch.context() as m:
         m.chdir(folder)
         for line in (
