@@ -20,7 +20,9 @@ from tests.test_logs import check, run
 from vaneloop.base import tables
 
 DBC = tables.path("vgv.dbc")
-QUICK = {".csv": 250, ".parquet": 250, ".log": 400, ".asc": 400, ".blf": 400, ".trc": 400, ".mf4": 150}
+# Damaged files of each format: that none of them takes the reader down says, with 95 % confidence, that fewer than
+# 3 in 1,000 of such damages would.
+FILES = 1_000
 MAPS: list[dict[str, str]] = [{}, {}, {"n_r": "n_dem"}]
 
 
@@ -113,22 +115,20 @@ def campaign(folder: Path, suffix: str, seeds: range, dbc: Path | None = None) -
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", list(FORMATS))
 def test_no_damage_takes_the_reader_down(tmp_path: Path, suffix: str, quick_mdf: None) -> None:
-    campaign(tmp_path, suffix, range(QUICK.get(suffix, 250)))
+    campaign(tmp_path, suffix, range(FILES))
 
 
 def test_no_damage_takes_the_reader_of_bus_mdf_down(tmp_path: Path, quick_mdf: None) -> None:
-    campaign(tmp_path, ".mf4", range(1000, 1000 + QUICK[".mf4"]), DBC)
+    campaign(tmp_path, ".mf4", range(1000, 1050), DBC)
+
+
+@pytest.mark.slow
+def test_no_damage_at_all_takes_the_reader_of_bus_mdf_down(tmp_path: Path, quick_mdf: None) -> None:
+    campaign(tmp_path, ".mf4", range(1050, 1000 + FILES), DBC)
 
 
 def test_damaged_statistics_of_a_parquet_do_not_end_the_process(tmp_path: Path) -> None:
     campaign(tmp_path, ".parquet", range(14_396, 14_397))  # a histogram too long: pyarrow 26 calls std::terminate
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("suffix", list(FORMATS))
-def test_long_campaign(tmp_path: Path, suffix: str, quick_mdf: None) -> None:
-    many = {".mf4": 2000, ".log": 2500, ".asc": 2500, ".trc": 2500}.get(suffix, 8000)
-    campaign(tmp_path, suffix, range(10_000, 10_000 + many))
 
 
 @pytest.mark.slow
