@@ -27,7 +27,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hil.logs.survey import survey
-from tests.browser import AXE, CHROMIUM, COLOURS, LONG, WHY_NOT, driver, look_at, shot, violations
+from tests.browser import AXE, CHROMIUM, LONG, WHY_NOT, driver, look_at, shot, violations
 from tests.conftest import ROOT, examples
 from tests.test_realtime import ON_TIME_US
 
@@ -193,18 +193,18 @@ def holds_focus(page: Any, selector: str) -> None:
 
 
 def looks(page: Any, name: str) -> None:
-    """A laptop, a wide screen, a phone, in light and dark: nothing sticks out, axe-core is content."""
-    for width, dark, rules in ((1280, False, AXE), (360, False, AXE), (360, True, COLOURS), (1920, True, AXE)):
+    """A laptop, a phone, a wide screen: nothing sticks out, axe-core is content, in light and in dark. A page has the
+    same elements on a laptop and on a wide screen, and no colour is set by a width.
+    """
+    for width, dark, rules in ((1280, False, AXE), (360, True, AXE), (1920, True, "")):
         page.set_viewport_size({"width": width, "height": 900})
         if dark != ("body--dark" in (page.locator("body").get_attribute("class") or "")):
             page.get_by_label("light or dark").click()
             page.wait_for_function(f"document.body.classList.contains('body--dark') === {str(dark).lower()}")
-        page.wait_for_timeout(700)  # charts and figures follow the width
-        assert page.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth"), (
-            f"{name} at {width}"
-        )
+        page.wait_for_timeout(700)  # charts are drawn in their new colours
+        page.wait_for_function("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
         shot(page, f"{name}_{width}_{'dark' if dark else 'light'}")
-        assert not violations(page, rules), f"{name} at {width}"
+        assert not (rules and violations(page, rules)), f"{name} at {width}"
     page.get_by_label("light or dark").click()
     page.set_viewport_size({"width": 1280, "height": 800})
 
@@ -1122,13 +1122,13 @@ def test_run_in_real_time_on_the_embedded_bus(server: Server, page: Any) -> None
 
     page.goto(server.at("run"))
     chosen = page.get_by_text("vaneloop run --bus local")
-    for _ in range(8):  # a page that is loaded anew loses a choice; started then, it would run in lockstep
+    for _ in range(48):  # a page that is loaded anew loses a choice; started then, it would run in lockstep
         if chosen.count():
             break
         with contextlib.suppress(Late):
-            page.locator(".bus").click(timeout=LONG / 4)
-            page.get_by_role("option", name="real time, embedded bus").click(timeout=LONG / 4)
-            chosen.wait_for(timeout=LONG / 4)
+            page.locator(".bus").click(timeout=LONG / 24)
+            page.get_by_role("option", name="real time, embedded bus").click(timeout=LONG / 24)
+            chosen.wait_for(timeout=LONG / 24)
     assert chosen.count(), "the bus was chosen, and the page does not say so"
     press(
         page, "Start", "parseFloat(document.querySelectorAll('.tiles .v')[0].innerText) > 3"
