@@ -55,7 +55,7 @@ test-all: $(READY_ALL)  ## all that `make test` leaves: long tests, more example
 	@$(need_chromium)
 	@mkdir -p out
 	@rm -f $(NOT_TESTED)
-	@$(PY) -m vaneloop.cli.ahead
+	@$(call ahead,$(if $(TESTS),,test-all))
 	@$(SAY) 'pytest: the long tests'
 	@$(ONE_THREAD) VANELOOP_NOT_TESTED=$(NOT_TESTED) $(PY) -m tests.vcan.run --beside $(PYTEST) $(TESTS) $(LONG_TESTS)
 
@@ -94,7 +94,7 @@ lint: $(READY)  ## ruff, mypy, and what the packages allow that are brought in
 	@$(PY) -m mypy
 
 compiled: $(READY_CORE)
-	@$(PY) -m vaneloop.cli.ahead
+	@$(call ahead)
 
 clean:  ## remove what the other targets made, the environment too
 	@rm -rf .venv .venv-* build dist demo out *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis vaneloop/base/ahead
@@ -110,7 +110,7 @@ $(READY_CORE): pyproject.toml constraints.txt | $(HOME_OF_VENV)
 
 # The core comes first; what is there already stays. What pip leaves of two processors compiles meanwhile.
 $(VENV)/.ready-%: pyproject.toml constraints.txt | $(READY_CORE)
-	@$(PY) -m vaneloop.cli.ahead >/dev/null 2>&1 & ahead=$$!; code=0; \
+	@{ $(call ahead,$*); } >/dev/null 2>&1 & ahead=$$!; code=0; \
 	{ $(call install,$*); } || code=$$?; \
 	wait $$ahead || true; \
 	exit $$code
@@ -156,6 +156,9 @@ $(SAY) "making $(VENV) with $$("$$found" --version)"; \
 rm -rf $(VENV); "$$found" -m venv $(VENV)
 endef
 
+# What the first commands run; of all tests, or of the environment for them, also what several of these run.
+ahead = $(PY) -m vaneloop.cli.ahead$(if $(filter test test-all,$(1)), && $(PY) -m tests.ahead)
+
 comma := ,
 define ruff
 $(SAY) 'ruff'; \
@@ -169,7 +172,7 @@ define tested
 $(ruff); \
 $(SAY) 'mypy, beside the others'; \
 $(PY) -m mypy >out/mypy.txt 2>&1 & types=$$!; code=0; \
-{ $(PY) -m vaneloop.cli.ahead && $(SAY) '$(1)' && $(ONE_THREAD) $(2); } || code=$$?; \
+{ $(call ahead,$(if $(TESTS),,test)) && $(SAY) '$(1)' && $(ONE_THREAD) $(2); } || code=$$?; \
 wait $$types || { code=1; $(SAY) 'mypy:'; cat out/mypy.txt; }; \
 exit $$code
 endef

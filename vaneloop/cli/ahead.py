@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import numba
@@ -30,7 +30,7 @@ from vaneloop.base.files import write
 from vaneloop.base.kept import AHEAD, sources_digest
 from vaneloop.cli.main import main as vaneloop
 
-__all__ = ["JOBS", "main"]
+__all__ = ["JOBS", "done_side_by_side", "main"]
 
 SECONDS = 40  # of the run that is searched
 
@@ -64,6 +64,27 @@ JOBS: tuple[dict[str, Callable[[Path], None]], ...] = (
 )
 
 
+def done_side_by_side(module: str, jobs: Iterable[str], folder: Path, environment: Mapping[str, str]) -> bool:
+    """Whether each job was done, all at once: ``python -m MODULE JOB FOLDER``. Says which was not, and why."""
+    running = {
+        job: subprocess.Popen(
+            python_module(module, job, str(folder)),
+            env=dict(environment),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for job in jobs
+    }
+    failed = False
+    for job, process in running.items():
+        said = process.communicate()[1]
+        if process.returncode:
+            print(f"[vaneloop] {job}: not compiled ahead: {said.strip()[-300:]}")
+            failed = True
+    return not failed
+
+
 def _what() -> str:
     processor = cpu_target.target_context.codegen().magic_tuple()
     return f"{sys.version} numba {numba.__version__} {processor} {sources_digest()}"
@@ -93,22 +114,8 @@ def main(words: list[str]) -> int:
     started = time.perf_counter()
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(AHEAD)}
     with tempfile.TemporaryDirectory() as folder:
-        for jobs in JOBS:
-            running = {
-                job: subprocess.Popen(
-                    python_module("vaneloop.cli.ahead", job, folder),
-                    env=environment,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.PIPE,
-                    text=True,
-                )
-                for job in jobs
-            }
-            for job, process in running.items():
-                said = process.communicate()[1]
-                if process.returncode:
-                    print(f"[vaneloop] {job}: not compiled ahead: {said.strip()[-300:]}")
-                    return 1
+        if not all(done_side_by_side("vaneloop.cli.ahead", jobs, Path(folder), environment) for jobs in JOBS):
+            return 1
     write(done, what)
     print(f"[vaneloop] compiled in {time.perf_counter() - started:.0f} s")
     return 0
