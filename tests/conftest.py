@@ -11,8 +11,9 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -34,13 +35,32 @@ def examples(thorough: int) -> int:
     return min(thorough, QUICK_EXAMPLES) if settings.get_current_profile_name() == "quick" else thorough
 
 
-# The modules with the longest tests, longest first. Each worker of xdist begins with some of them, so that none is left
-# for the end, when the others have nothing more to do.
-LONG = (
-    "real_data", "docs", "web", "help", "logs_fuzz", "fuzz", "hidden_law", "fleet_report", "learn", "native", "fmu",
-    "reading", "fleet_run", "kept", "rig", "record", "learn_periods", "your_own_model", "learn_stops", "realtime",
-    "strategies", "same_answer", "design", "learn_surfaces", "own_laws", "electromechanical", "effects",
-    "search_commands", "held", "learn_turns",
+def quick_first(cases: Iterable[Any], quick: int = 1) -> list[Any]:
+    """Cases of one kind for `parametrize`: `make test` runs the first, the others are left to `make test-all`."""
+    return [
+        case if n < quick else pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.slow)
+        for n, case in enumerate(cases)
+    ]
+
+
+# Modules that use what a process makes once: the rig's loop, which numba keeps in no file; models of one's own; sources
+# as syntax trees. One worker of xdist has them, one after the other.
+WITH_THE_RIG = (
+    "rig", "same_answer", "electromechanical", "learn_vanes", "readings", "strategies", "learn_periods", "long_logs",
+    "loggers", "hidden_effect", "learn_stops", "machines", "schedule", "recorders", "directions", "tolerances",
+    "rivals", "learn_lags", "learn_followers",
+)  # fmt: skip
+OF_ONES_OWN = (
+    "your_own_model", "learn", "hidden_law", "learn_differences", "rig_learned", "own_laws", "learn_surfaces",
+    "learn_speed", "doubts",
+)  # fmt: skip
+OF_SOURCES = ("structure", "writers", "child", "exit_codes", "extras", "settings")
+# These and the other modules with the longest tests, longest first. Each worker begins with some of them, so that none
+# is left for the end, when the others have nothing more to do.
+LONG: tuple[tuple[str, ...], ...] = (
+    ("real_data",), ("docs",), ("web",), ("help",), ("native",), ("fuzz",), ("logs_fuzz",), OF_ONES_OWN, WITH_THE_RIG,
+    ("record",), ("reading",), ("fleet_report",), ("fleet_run",), ("realtime",), ("design",), ("effects",),
+    ("search_commands",), OF_SOURCES, ("fmu",), ("kept",), ("held",), ("learn_turns",),
 )  # fmt: skip
 
 
@@ -48,12 +68,13 @@ def longest_first(modules: list[str], workers: int) -> list[int]:
     """Order of tests, given by their modules, for workers that begin with an even share of them each, one after the
     other: each share begins with long modules.
     """
-    long = [f"tests.test_{name}" for name in LONG]
     shares: list[list[int]] = [[] for _ in range(workers)]
-    for n, name in enumerate(long):
+    for n, group in enumerate(LONG):
         turn = n % (2 * workers)  # there and back: 0, 1, 1, 0, ...
-        shares[min(turn, 2 * workers - 1 - turn)] += [i for i, m in enumerate(modules) if m == name]
-    rest = [i for i, m in enumerate(modules) if m not in long]
+        for name in group:
+            shares[min(turn, 2 * workers - 1 - turn)] += [i for i, m in enumerate(modules) if m == f"tests.test_{name}"]
+    taken = {i for share in shares for i in share}
+    rest = [i for i in range(len(modules)) if i not in taken]
     size = len(modules) // workers
     for share in shares[:-1]:
         missing = max(size - len(share), 0)

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from tests import costs
-from tests.conftest import ROOT
+from tests.conftest import LONG, ROOT, longest_first
 
 CASE = (
     '<testcase><properties><property name="file" value="{}"/><property name="cpu_s" value="{}"/></properties>{}'
@@ -49,3 +49,16 @@ def test_a_run_reports_what_its_tests_and_their_children_took(tmp_path: Path) ->
 def test_the_page_has_a_place_for_the_table() -> None:
     page = (ROOT / costs.PAGE).read_text(encoding="utf-8")
     assert page.index(costs.BEGIN) < page.index(costs.END)
+
+
+def test_each_worker_begins_with_long_modules_and_every_test_is_run_once() -> None:
+    long = [name for group in LONG for name in group]
+    assert len(set(long)) == len(long) and all((ROOT / f"tests/test_{name}.py").is_file() for name in long)
+    modules = [f"tests.test_{name}" for name in ("a", "web", "docs", "b", "real_data", "rig", "web", "c", "a", "held")]
+    for workers in (1, 2, 3, 4):
+        order = longest_first(modules, workers)
+        assert sorted(order) == list(range(len(modules)))
+        assert all(
+            modules[order[k * len(modules) // workers]] not in ("tests.test_a", "tests.test_c")
+            for k in range(min(workers, 3))
+        )
