@@ -139,7 +139,11 @@ NAMES: dict[str, str] = {
 # pages whose steps, together, take a processor seconds, and whose commands other quick tests run
 DEAR = [
     "README.md",
-    *(f"docs/{name}.md" for name in ("bus", "diagnosis", "engine_test", "fmu", "injection", "machines")),
+    *(
+        f"docs/{name}.md"
+        for name in ("benchmarks", "bus", "coming_from_inca", "diagnosis", "engine_test", "fmu", "injection")
+    ),
+    *(f"docs/{name}.md" for name in ("linkage", "machines")),
     *(
         f"docs/{name}.md"
         for name in ("own_controller", "pandas", "python", "real_time", "replay", "rig", "your_own_model")

@@ -20,7 +20,7 @@ from hil.logs.mapping import Bench, read_mapping, write_mapping
 from hil.logs.mdf_write import write_groups
 from hil.logs.names import is_time, meaning
 from hil.logs.survey import sparkline, survey
-from tests.conftest import ROOT, examples
+from tests.conftest import ROOT, examples, quick_first
 from tests.test_logs import DATA, data
 from vaneloop.base.errors import InputError
 from vaneloop.base.signals import UNITS
@@ -777,15 +777,15 @@ COMMANDS = [
     ["compare", "{log}"],
     ["locate", "{log}"],
     ["diagnose", "{log}"],
-    ["experiment", "{log}"],
     ["extend", "{log}", "--effect", "valve_dead_band", "--out", "{folder}/m.toml"],
     ["schedule", "--log", "{log}"],
     ["run", "--bus", "lockstep", "--log", "{log}"],
     ["run", "--bus", "lockstep", "--profile", "{log}"],
+    ["experiment", "{log}"],
 ]
 
 
-@pytest.mark.parametrize("words", COMMANDS, ids=[" ".join(w) for w in COMMANDS])
+@pytest.mark.parametrize("words", quick_first(COMMANDS, len(COMMANDS) - 1), ids=[" ".join(w) for w in COMMANDS])
 def test_every_guess_is_in_text_and_json_of_a_command(
     tmp_path: Path, run: dict[str, np.ndarray], words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:

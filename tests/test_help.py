@@ -149,7 +149,7 @@ SMALLER = {"--frames 10000000": "--frames 20000", "--logs 40": "--logs 1 --durat
 LONG = {"strategies", "design", "spatial", "clearance", "experiment", "diagnose", "engine-test"}
 LONG_EXAMPLES = {
     "inject --all", "schedule --geometry", "engine-test --tables", "export-fmu --part controller",
-    "benchmarks.hidden_effect --logs 40", "benchmarks.hidden_effect --plant",
+    "benchmarks.hidden_effect",
 }  # fmt: skip
 
 

@@ -654,6 +654,7 @@ def test_a_curve_has_the_shape_that_is_known(shape: tuple[str, ...]) -> None:
             assert np.min(up * np.diff(y)) >= -1e-9 * size
 
 
+@pytest.mark.slow
 def test_a_curve_that_is_known_to_rise_from_zero_is_learned_so() -> None:
     (law,) = learn([bent_valve()], VALVE, shape=("rising", "zero")).laws
     assert law.error_after < 1.5

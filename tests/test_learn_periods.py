@@ -105,6 +105,7 @@ def test_a_wave_in_the_error_is_found_and_noise_is_none(seed: int, f: float, wav
     assert Lines([course(seed, 0.0, f)]).periods() == []
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000), st.floats(0.5, 35.0))
 def test_a_gain_that_swings_is_found_beside_the_motion_that_it_acts_on(seed: int, f: float) -> None:
     rng = np.random.default_rng(seed)

@@ -208,6 +208,7 @@ ANY = st.one_of(
 )
 
 
+@pytest.mark.slow
 @given(st.sampled_from(["of", "low", "high", "knots", "form", "been"]), ANY, st.booleans(), st.booleans())
 @settings(max_examples=examples(150), deadline=None)
 def test_no_law_file_ends_in_a_traceback(bound, key: str, value: Any, drop: bool, outer: bool) -> None:

@@ -18,6 +18,7 @@ from plant.curve import PLACES, quantity_of
 from plant.layout import MOST_CURVES
 from plant.model import Learned
 from tests import rig
+from tests.conftest import quick_first
 from tests.firmware_on_rig import firmware
 from vaneloop.base.errors import InputError
 from vaneloop.cli.main import main
@@ -127,7 +128,7 @@ def chain(model: Model | None = None):
     return Log("rig", channels), build_chain(Log("rig", channels))
 
 
-@pytest.mark.parametrize("what", SAME)
+@pytest.mark.parametrize("what", quick_first(SAME, 2))
 def test_in_its_stage_a_curve_is_the_effect_that_it_imitates(what: str) -> None:
     curve, effects = SAME[what]
     log, plain = chain()

@@ -116,6 +116,7 @@ def test_engine_test_is_as_long_as_the_papers(of_dual_curves, of_a_single_curve)
     assert dual.signals[0].samples > 30_000 and single.signals[0].samples == dual.signals[0].samples
 
 
+@pytest.mark.slow
 def test_dual_curves_stay_below_the_papers_errors(of_dual_curves) -> None:
     vigv = of_dual_curves.signals[0]
     assert vigv.max_abs <= 2.17 and vigv.mean_abs <= 0.55 and vigv.mean_abs_99_100 <= 0.47

@@ -269,6 +269,7 @@ def test_a_campaign_whose_tests_fail_unchanged_says_so(tmp_path: Path) -> None:
     assert run.returncode != 0 and "fails without any change" in run.stderr and "test_wrong" in run.stderr
 
 
+@pytest.mark.slow
 def test_every_equivalent_mutant_listed_is_one_and_has_a_reason() -> None:
     import tomllib
 

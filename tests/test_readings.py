@@ -11,6 +11,7 @@ import pytest
 
 from hil.logs import Channel, Log
 from plant import Model
+from tests.conftest import quick_first
 from tests.firmware_on_rig import firmware
 from tests.rig import Hidden, manoeuvre, simulate
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
@@ -40,7 +41,7 @@ def fast() -> dict[str, np.ndarray]:
     return recorded([], 31, 1000)
 
 
-@pytest.mark.parametrize("begin", [0, 4, 9])
+@pytest.mark.parametrize("begin", quick_first([4, 0, 9]))
 def test_a_fast_log_is_put_on_the_controllers_frame_wherever_it_begins(fast: dict[str, np.ndarray], begin: int) -> None:
     chain = chain_of(fast, slice(begin, None))
     for name in ("demand", "servo", "actuator"):
@@ -142,6 +143,7 @@ def test_many_effects_that_leave_much_are_an_imitation() -> None:
     assert verdict("a") == "missing" and verdict("a", "b", "c") == "unknown"
 
 
+@pytest.mark.slow
 def test_a_stroke_far_behind_is_smoothed_no_rounder_than_it_was() -> None:
     """The linkage takes the lag off the smoothed stroke: what smoothing cut off its corners would ask for more laws."""
     stage = chain_of(recorded([Hidden("lvdt_lag", {"time_constant": 0.0267})], 55, 100)).stage("linkage")
@@ -154,6 +156,7 @@ def test_a_stroke_far_behind_is_smoothed_no_rounder_than_it_was() -> None:
     assert np.all(rms_per_output(judge, fit) < 1.03 * stage.floor)
 
 
+@pytest.mark.slow
 def test_extend_fits_an_effect_where_the_log_shows_it_most_clearly() -> None:
     """To the actuator a wrong gain of the LVDT is a wrong flow gain, which is known within its tolerance only."""
     chain = chain_of(recorded([Hidden("lvdt_gain", {"factor": 0.9845})], 7, 100, 100.0))

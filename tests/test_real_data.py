@@ -184,7 +184,8 @@ def said_of_valve(data_dir: Path, name: str) -> tuple[str, set[str]]:
     return answer.verdict, {n.split(".")[1] for e in effects for n in (e["effect"], *e["rivals"])}
 
 
-@pytest.mark.parametrize("day", ["0825", *(pytest.param(day, marks=pytest.mark.slow) for day in ("0609", "1002"))])
+@pytest.mark.slow
+@pytest.mark.parametrize("day", ["0609", "0825", "1002"])
 def test_the_sticking_valve_sticks_on_each_of_its_days(data_dir: Path, day: str) -> None:
     # without a jump stiction is play, and at ten seconds a sample the jump is hardly seen: the answer has both
     verdict, named = said_of_valve(data_dir, f"stiction_FIC20102_{day}")

@@ -16,6 +16,7 @@ from hil.inject.in_lanes import can, margins_in_lanes
 from hil.inject.margin import margins
 from hil.inject.scenario import COUNTS, SIGNALS
 from plant import Model, Plant, build_plant
+from tests.conftest import quick_first
 from tests.test_lanes import drawn
 
 ON_THE_BUS = {"babbling_idiot", "bus_off_controller"}  # when the queues empty depends on the length of each frame
@@ -59,7 +60,7 @@ def assert_same(name: str, scenario: Scenario, plants: list[Plant]) -> list[inje
     return outcomes
 
 
-@pytest.mark.parametrize("name", ["demand_gap_200ms", "status_lost", "standby_asked"])
+@pytest.mark.parametrize("name", quick_first(["demand_gap_200ms", "status_lost", "standby_asked"], 2))
 def test_a_shipped_scenario_in_lanes_is_the_one_on_the_bus(name: str) -> None:
     scenario = load_scenario(name)
     assert_same(name, scenario, machines(scenario, 2, len(name)))
