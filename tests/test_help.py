@@ -11,6 +11,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -41,6 +42,7 @@ def parser_of(name: str) -> terminal.Parser:
     return parser
 
 
+@cache
 def examples(name: str) -> list[list[str]]:
     """Words behind ``vaneloop`` or ``python -m`` of every example in a help; what is two blanks away is a remark."""
     text = parser_of(name).format_help()
