@@ -45,13 +45,9 @@ def held(campaign: Campaign, frames: int) -> None:
 
 
 @pytest.mark.slow
-def test_three_hundred_thousand_frames_do_no_harm() -> None:
-    held(fuzz.fuzz(300_000, seed=11), 300_000)
-
-
-@pytest.mark.slow
-def test_two_million_frames_do_no_harm() -> None:
-    held(fuzz.fuzz(2_000_000, seed=12), 2_000_000)
+def test_a_million_frames_do_no_harm() -> None:
+    """So fewer than three in a million such frames would, with 95 % confidence."""
+    held(fuzz.fuzz(1_000_000, seed=12), 1_000_000)
 
 
 def test_the_same_seed_gives_the_same_campaign_and_another_another() -> None:
@@ -243,14 +239,14 @@ def test_sequences_of_both_protocols_do_no_harm() -> None:
 
 
 @pytest.mark.slow
-def test_sixty_thousand_frames_of_sequences_do_no_harm() -> None:
-    hostile("both", 60_000)
+def test_thirty_thousand_frames_of_sequences_do_no_harm() -> None:
+    hostile("both", 30_000)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tool", ["xcp", "uds"])
-def test_two_hundred_thousand_hostile_commands_of_a_tool_do_no_harm(tool: str) -> None:
-    hostile(tool, 200_000)
+def test_a_hundred_thousand_hostile_commands_of_a_tool_do_no_harm(tool: str) -> None:
+    hostile(tool, 100_000)
 
 
 FREE = np.array([np.inf, np.inf])

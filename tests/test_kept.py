@@ -87,7 +87,8 @@ def test_what_was_compiled_ahead_is_read_and_left_as_it_is(tmp_path: Path) -> No
 
 @pytest.mark.slow
 def test_after_the_set_up_the_first_replay_and_diagnosis_compile_nothing(tmp_path: Path) -> None:
-    env = {**os.environ, "VANELOOP_AHEAD": str(tmp_path / "ahead"), "NUMBA_CACHE_DIR": str(tmp_path / "user")}
+    """What `make` has compiled is enough; where nobody has, it is compiled now."""
+    env = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "user")}
     for words in (
         ["vaneloop.cli.ahead"],
         ["vaneloop", "replay", "examples/engine_run.blf"],
@@ -97,7 +98,7 @@ def test_after_the_set_up_the_first_replay_and_diagnosis_compile_nothing(tmp_pat
             [sys.executable, "-m", *words], cwd=ROOT, env=env, capture_output=True, text=True, check=False
         )
         assert done.returncode in (0, 1), done.stderr
-        assert ("compiling" in done.stdout + done.stderr) == (words == ["vaneloop.cli.ahead"]), done.stdout
+        assert words == ["vaneloop.cli.ahead"] or "compiling" not in done.stdout + done.stderr, done.stdout
     assert not list((tmp_path / "user").rglob("*.nbc"))
 
 
