@@ -204,6 +204,6 @@ def test_three_thousand_seconds_at_one_kilohertz_take_little_time():
     t = raster(3000.0, 1000.0)
     y = np.random.default_rng(0).normal(0, 0.03, t.size)
     noise_floor(t[:1000], y[:1000])
-    start = time.perf_counter()
+    start = time.process_time()
     noise_floor(t, y)
-    assert time.perf_counter() - start < 3.0
+    assert time.process_time() - start < 3.0
