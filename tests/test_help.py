@@ -146,7 +146,8 @@ SMALLER = {"--frames 10000000": "--frames 20000", "--logs 40": "--logs 1 --durat
            "--logs 60": "--logs 1 --duration 60 --seed 3",  # a draw at random takes up to five times as long
            "--out out/motor.parquet": "--out out/motor.parquet --logs 1 --duration 60",
            "engine-test --": "engine-test --profile short.toml --",  # whole in docs/engine_test.md and the README
-           "strategies --": "strategies --dwell 0.05 --"}  # fmt: skip
+           "strategies --": "strategies --dwell 0.05 --",
+           "inject --all --junit": "inject demand_stops --junit"}  # all of them in the README  # fmt: skip
 # commands whose examples take long
 LONG = {"strategies", "design", "spatial", "clearance", "experiment", "diagnose", "engine-test"}
 LONG_EXAMPLES = {

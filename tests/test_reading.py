@@ -578,8 +578,9 @@ def blf(containers: list[bytes], stated: int | None = None) -> bytes:
     """A BLF whose containers unpack to these bytes."""
     out = io.BytesIO()
     out.write(b"LOGG" + (144).to_bytes(4, "little") + bytes(136))
+    zipped = {body: zlib.compress(body, 9) for body in set(containers)}
     for body in containers:
-        packed = zlib.compress(body, 9)
+        packed = zipped[body]
         size = 32 + len(packed)
         out.write(
             struct.pack("<4sHHIIH6xI4x", b"LOBJ", 16, 1, size, 10, 2, stated or len(body)) + packed + bytes(size % 4)
