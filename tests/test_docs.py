@@ -487,24 +487,25 @@ def before(page: str, step: Step, folder: Path) -> dict[str, Any]:
     return {}
 
 
-SAID: dict[str, str] = {}  # what a command that several pages have printed, where it only reads what ships
+SAID: dict[str, str] = {}  # what a command printed that several pages have, and that only reads what ships
 
 
-def run_command(text: str, heard: pytest.CaptureFixture[str]) -> None:
-    """A command line, in this process where it is ours; once, where several pages have it."""
+def run_shared(text: str, heard: pytest.CaptureFixture[str]) -> None:
+    """A command line; one that only reads what ships is run once for all pages."""
     words = shlex.split(text)
-    reads = len(words) == 3 and words[2].startswith(("examples/", "--all")) or text.startswith("python -m hil.replay")
+    if not (len(words) == 3 and words[2].startswith(("examples/", "--all")) or text.startswith("python -m hil.replay")):
+        run_command(text)
+        return
     before = heard.readouterr()
-    if reads and text not in SAID:
-        run_words(words, text)
+    if text not in SAID:
+        run_command(text)
         SAID[text] = "".join(heard.readouterr())
-    elif not reads:
-        run_words(words, text)
-    print(*before, SAID[text] if reads else "", sep="")
+    print(*before, SAID[text], sep="")
 
 
-def run_words(words: list[str], text: str) -> None:
-    """A command, in this process where it is ours."""
+def run_command(text: str) -> None:
+    """A command line, in this process where it is ours."""
+    words = shlex.split(text)
     if words[0] == "vaneloop":
         with pytest.MonkeyPatch.context() as m:
             m.setattr(sys, "argv", words)
@@ -556,7 +557,7 @@ def run_page(page: str, folder: Path, request: pytest.FixtureRequest, long: bool
             given = before(page, run, folder)
             try:
                 if run.kind == "command":
-                    run_command(run.text, heard)
+                    run_shared(run.text, heard)
                 else:
                     file = folder / f"line_{s.line}.py"  # numba caches compiled code beside a file
                     file.write_text(run.text, encoding="utf-8")
