@@ -1,0 +1,804 @@
+"""A user's own model against logs whose answer a closed form knows: what is taken in, what noise and motion they hold,
+which parameters and starts suit them, and what a curve does at each place.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy
+
+from hil.logs.notes import Note
+from plant.model import Learned
+from vaneloop.identification import Parameter, Record, StageError, System, unknown
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.results import StageDiagnosis
+from vaneloop.identification.selection.diagnosis import diagnose_stage
+from vaneloop.identification.settings import LEVEL_SPREAD
+from vaneloop.identification.subsystem import Array
+from vaneloop.identification.user_models.bound_system import BoundSystem
+from vaneloop.identification.user_models.by_log import ByLog, Logs, as_given, bind, parameter_warnings
+from vaneloop.identification.user_models.data import Data, noise_of_channel, noise_of_neighbours, without_order
+from vaneloop.identification.user_models.experiment import SHAPES, Limits, _Bench, _Parameters
+from vaneloop.identification.user_models.motion import differentiated_to, highest_frequency, low_pass, motion, smoothed
+
+# docs/settings.md
+LEAST_SAMPLES, LEAST_POINTS, INPUT_NAN = 50, 12, 0.2
+FORCE_SHARE, FLAT_TO, MOVES = 0.9995, 3.0, 0.3
+WIDE, GIVEN = 4.0, 12.0
+NO_HELP = 0.85
+
+T = 0.1 * np.arange(60)  # s
+
+
+def white(seed: int, n: int) -> Array:
+    return np.random.default_rng(seed).standard_normal(n)
+
+
+def gain(u: Any, p: Any) -> Any:
+    return p.a * u.u
+
+
+def mapping(**more: Any) -> System:
+    given: dict[str, Any] = {
+        "model": gain, "outputs": {"y": "V"}, "inputs": {"u": "A"}, "parameters": [unknown("a", 1.0, "V/A")],
+    }  # fmt: skip
+    return System("map", "static", **given | more)
+
+
+def mover(**more: Any) -> System:
+    """A mass and a damper whose force is measured with its displacement ``x`` (mm)."""
+    given: dict[str, Any] = {
+        "outputs": {"f": "N"}, "position": "x", "units": {"position": "mm"},
+        "parameters": [unknown("m", 1.0, "kg"), unknown("c", 1.0, "N s/m")],
+    }  # fmt: skip
+    return System("mover", "force", lambda u, p: p.m * u.acceleration + p.c * u.velocity, **given | more)
+
+
+def turning(**more: Any) -> System:
+    """A shaft: its angle follows its speed, which an input drives and a damper brakes."""
+    given: dict[str, Any] = {
+        "outputs": {"angle": "rad"}, "inputs": {"u": "A"}, "states": {"angle": "rad", "speed": "rad/s"},
+        "rates": {"speed": "angle"}, "parameters": [unknown("c", 0.5, "1/s")],
+    }  # fmt: skip
+    return System("shaft", "simulate", lambda x, u, p: (x.speed, u.u - p.c * x.speed), **given | more)
+
+
+def record(t: Array = T, name: str = "log", begin: float = 0.0, ordered: bool = True, **columns: Any) -> Record:
+    return Record(name, t, {k: np.asarray(v, dtype=float) for k, v in columns.items()}, begin, (), ordered)
+
+
+def put(values: Array, at: Any, value: float = np.nan) -> Array:
+    out = np.array(values, dtype=float)
+    out[at] = value
+    return out
+
+
+# ---- what a log must be ----------------------------------------------------------------------------------------------
+
+U, Y = np.sin(T), 2.0 * np.sin(T)
+
+
+@pytest.mark.parametrize(
+    ("system", "log", "said"),
+    [
+        (mapping(), record(u=U, yy=Y), "log: no channel 'y', which system 'map' needs; close: yy; the log has u, yy"),
+        (mapping(), record(T[:11], u=U[:11], y=Y[:11]), "log: 11 samples; at least 12 are needed"),
+        (mover(), record(T[:49], x=U[:49], f=Y[:49]), "log: 49 samples; at least 50 are needed"),
+        (mapping(), record(T[None], u=U, y=Y), "log: 60 samples; at least 12 are needed"),
+        (mapping(), record(put(T, 7, T[6]), u=U, y=Y), "log: time must rise from sample to sample"),
+        (mapping(), record(put(T, 59, np.inf), u=U, y=Y), "log: time must rise from sample to sample"),
+        (mapping(), record(put(T, 59, 2e60), u=U, y=Y), "log: time reaches 2e+60 s; allowed: 1e+60"),
+        (mapping(), record(u=put(U, 3, 2e60), y=Y), "log: channel 'u' reaches 2e+60; allowed: 1e+60"),
+        (mapping(), record(u=U, y=Y[1:]), "log: channel 'y' has shape (59,); (60,) is needed, as the time has"),
+        (
+            mapping(), record(u=put(U, slice(20, 33)), y=Y),
+            "log: channel 'u': 13 of 60 samples are NaN; an input may lack 20 % at most",
+        ),
+        (
+            turning(window=1.0, outputs={"angle": "rad"}, rates={}), record(u=U, angle=Y),
+            "system 'shaft': window= needs state 'speed' measured at every start; the log has u, angle (name a channel "
+            "like it, or declare it in rates= as the rate of a measured one)",
+        ),
+    ],
+)  # fmt: skip
+def test_a_log_that_a_system_cannot_take_gets_one_line(system: System, log: Record, said: str) -> None:
+    with pytest.raises(StageError) as e:
+        Data(system, [log]).restarts(0, 60)
+    assert str(e.value) == said
+
+
+def test_a_log_is_taken_up_to_the_limits_that_the_lines_name() -> None:
+    n = LEAST_POINTS
+    d = Data(mapping(), [record(T[:n] + 5.0, u=put(U[:n], 0, 1e60), y=Y[:n], begin=2.0)])
+    assert d.records[0].t[0] == 0.0 and d.times[0] == pytest.approx(T[:n] + 2.0) and d.u[0][0, 0] == 1e60
+    assert Data(mover(), [record(T[:LEAST_SAMPLES], x=U[:LEAST_SAMPLES], f=Y[:LEAST_SAMPLES])]).ordered
+    gap = slice(20, 20 + round(INPUT_NAN * len(T)))
+    d = Data(mapping(), [record(u=put(3.0 * T, gap), y=put(Y, gap))])
+    assert d.u[0][0] == pytest.approx(3.0 * T) and np.isnan(d.y[0][0, gap]).all()
+    (note,) = d.notes
+    assert note == "log: u: 12 NaN filled from their neighbours"
+    assert isinstance(note, Note) and (note.kind, note.of, note.number) == ("filled", "u", 12)
+    assert note.rows == tuple(range(21, 33))
+    with pytest.raises(StageError, match="system 'map': no log"):
+        Data(mapping(), [])
+
+
+def test_a_log_counts_from_where_all_that_drives_the_model_is_known_to_where_the_first_of_it_ends() -> None:
+    system = mapping(inputs={"u": "A", "w": "A"}, outputs={"y": "V"})
+    log = record(T + 1.0, u=put(U, slice(0, 4)), w=put(put(U, slice(0, 2)), slice(54, 60)), y=Y, begin=7.0)
+    d = Data(system, [log])
+    assert len(d.t) == LEAST_SAMPLES and d.times[0][[0, -1]] == pytest.approx([7.4, 7.0 + T[53]])
+    assert d.records[0].t == pytest.approx(T[:50]) and d.measured[0] == pytest.approx(Y[4:54])
+    assert d.notes == ["log: 10 samples at its ends, where what drives the model is not known, do not count"]
+    shorter = Data(system, [record(u=put(U, slice(0, 5)), w=put(U, slice(54, 60)), y=Y)])  # too few would be left
+    assert len(shorter.t) == 60 and shorter.u[0][0, 0] == U[5] and shorter.u[0][1, -1] == U[53]
+
+
+def test_logs_follow_each_other_on_one_time_axis_under_names_of_their_own() -> None:
+    a, b = record(u=U, y=Y), record(2.0 * T, u=U, y=Y, begin=3.0)
+    d = Data(mapping(), [a, b, a])
+    assert list(d.logs) == ["log", "log'", "log''"] and d.logs["log'"] == slice(60, 120)
+    assert d.t == pytest.approx(np.concatenate([T, 6.0 + 2.0 * T, 18.0 + T]))
+    assert list(Data(mapping(), [a], like=d).logs) == ["log'''"]
+    conditions, units = d.regimes()
+    assert list(conditions) == ["time", "u", "y", "log"]
+    assert units == {"time": "s", "u": "A", "y": "V", "log": ""}
+    assert conditions["log"].tolist() == [1.0] * 60 + [2.0] * 60 + [3.0] * 60
+    assert list(Data(mapping(), [record(u=U, y=put(Y, 3), ordered=False)]).regimes()[0]) == ["u", "y"]
+
+
+# ---- where states start ----------------------------------------------------------------------------------------------
+
+
+def test_a_state_starts_at_what_the_user_gives_else_at_the_first_of_three_readings() -> None:
+    read = record(u=U, angle=put(Y + 1.0, [0, 1]))
+    d = Data(turning(start={"speed": 4}), [read])
+    assert d.first_state(0, "speed", 9.0) == 4.0 and d.first_state(0, "speed", 9.0, at=1) == 9.0
+    assert d.first_state(0, "angle", 9.0) == Y[2] + 1.0
+    blind = Data(turning(), [record(u=U, angle=put(Y, [0, 1, 2]))])
+    assert blind.first_state(0, "angle", 9.0) == 9.0
+    first, size = blind.begin(0, "angle")
+    assert first == 0.0 and size == pytest.approx(np.std(Y[3:]))
+
+
+@pytest.mark.parametrize("speed", [-2.0, 0.0, 2.0])
+def test_a_velocity_that_starts_at_rest_but_was_none_is_said(speed: float) -> None:
+    t = 0.01 * np.arange(400)
+    d = Data(turning(), [record(t, u=np.sin(t), angle=speed * t + 0.5 * np.sin(3.0 * t))])
+    v = speed + 1.5 * np.cos(3.0 * t)
+    first, size = d.begin(0, "speed")
+    assert first == pytest.approx(v[0], abs=0.1) and size == pytest.approx(np.sqrt(np.mean(v**2)), rel=0.02)
+    said = d.begins_in_motion(0, "speed")
+    assert bool(said) == (abs(first) > MOVES * size)
+    if said:
+        assert said == [
+            f"log: speed is about {first:.3g} rad/s at the start, where the model starts at rest; "
+            "start={'speed': 'fitted'} fits it"
+        ]
+    still = Data(turning(), [record(t, u=np.sin(t), angle=1.0 - np.cos(3.0 * t))])
+    assert still.begins_in_motion(0, "speed") == []
+    assert Data(turning(outputs={"speed": "rad/s"}), [record(t, u=t, speed=t)]).begin(0, "angle") == (0.0, 0.0)
+
+
+def test_windows_begin_anew_at_their_length_from_what_is_measured_there() -> None:
+    t = 0.01 * np.arange(400)
+    angle = np.sin(2.0 * t)
+    d = Data(turning(window=0.5), [record(t, u=t, angle=put(angle, 150))])
+    first, values = d.restarts(0, 300)
+    assert np.flatnonzero(first).tolist() == [0, 50, 100, 200, 250]  # not at 150, where nothing was measured
+    assert values.shape == (2, 300) and values[0, 50] == angle[50]
+    assert values[1, 50:250] == pytest.approx(2.0 * np.cos(2.0 * t[50:250]), abs=0.05)
+    assert d.restarts(0, 300)[1] == pytest.approx(values, nan_ok=True)
+    free = Data(turning(), [record(t, u=t, angle=angle)]).restarts(0, 300)
+    assert not free[0].any() and len(free[0]) == 300 and free[1].tolist() == [[0.0], [0.0]]
+
+
+def test_the_force_that_is_held_at_the_start_is_the_median_of_five_readings() -> None:
+    f = put(Y, slice(0, 5), 3.0)
+    d = Data(mover(velocity="v"), [record(x=U, v=U, f=put(put(f, 1), 2, 50.0))])
+    assert d.held(0) == 3.0
+    assert Data(mover(velocity="v"), [record(x=U, v=U, f=put(Y, slice(0, 5)))]).held(0) == 0.0
+
+
+# ---- noise -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [40, 300, 3000])
+def test_the_noise_of_a_channel_is_that_of_the_white_noise_on_a_motion(n: int) -> None:
+    t = np.arange(n) / 100.0
+    levels = [noise_of_channel(5.0 * np.sin(0.7 * t) + 0.2 * white(seed, n)) for seed in range(8)]
+    assert np.mean(levels) == pytest.approx(0.2, rel=0.3 if n == 40 else 0.1)
+    assert noise_of_channel(0.2 * white(0, 39)) == 0.0
+    # half the log may shake much more: the quieter half tells
+    shaken = np.where(np.arange(n) < 0.45 * n, 20.0, 1.0) * 0.2 * white(1, n)
+    assert noise_of_channel(shaken) < 0.5
+
+
+def test_rows_in_no_order_have_the_noise_of_planes_through_their_neighbours() -> None:
+    rng = np.random.default_rng(1)
+    u = rng.uniform(-1.0, 1.0, (2, 1500)) * [[3.0], [500.0]]
+    y = np.sin(0.5 * u[0]) + 1e-3 * u[1] + 0.05 * white(2, 1500)
+    assert without_order(u) and not without_order(np.sort(u)) and not without_order(np.vstack([u, np.sort(u[:1])]))
+    assert without_order(np.vstack([u, np.ones((1, 1500))])) and not without_order(np.ones((2, 1500)))
+    assert noise_of_neighbours(u, y) == pytest.approx(0.05, rel=0.12)
+    assert noise_of_neighbours(np.vstack([u, np.ones((1, 1500))]), y) == noise_of_neighbours(u, y)
+    assert noise_of_neighbours(u[:, :16], y[:16]) > 0.0 and noise_of_neighbours(u[:, :15], y[:15]) == 0.0
+    system = mapping(inputs={"u": "A", "w": "A"})
+    data = Data(system, [record(np.arange(1500.0), u=u[0], w=u[1], y=put(y, 5))])
+    assert data.noise() == pytest.approx([0.05], rel=0.12)
+    assert Data(mapping(), [record(u=U, y=np.zeros(60))]).noise().tolist() == [1e-300]
+    straight = Data(mapping(), [record(u=U, y=T)]).noise()
+    assert straight == pytest.approx([1e-6 * np.std(T)], rel=0.01)
+
+
+# ---- measured motion -------------------------------------------------------------------------------------------------
+
+FINE = 0.001 * np.arange(8000)
+
+
+def test_a_low_pass_keeps_cubics_and_looks_one_period_far() -> None:
+    cubic = 3.0 - FINE + 2.0 * FINE**2 - 0.3 * FINE**3
+    inner = slice(500, -500)
+    assert low_pass(FINE, cubic, 5.0)[inner] == pytest.approx(cubic[inner], abs=1e-9)
+    for share, passed in ((0.2, 0.999), (0.5, 0.956)):
+        wave = np.sin(2.0 * np.pi * 10.0 * share * FINE)
+        got = low_pass(FINE, wave, 10.0)[inner]
+        assert got @ wave[inner] / (wave[inner] @ wave[inner]) == pytest.approx(passed, abs=2e-3)
+    impulse = put(np.zeros(8000), 4000, 1.0)
+    answer = low_pass(FINE, impulse, 10.0)
+    assert np.flatnonzero(np.abs(answer) > 1e-12)[[0, -1]].tolist() == [3900, 4100]
+    assert answer[3900:4001] == pytest.approx(answer[4000:4101][::-1], abs=1e-15) and answer.sum() == pytest.approx(1.0)
+    assert low_pass(FINE, put(3.0 * FINE, slice(3000, 3100)), 5.0)[inner] == pytest.approx(3.0 * FINE[inner])
+    assert low_pass(FINE, np.full(8000, np.nan), 5.0) == pytest.approx(np.zeros(8000))
+    assert low_pass(FINE, np.full(8000, 4.0), 5.0) == pytest.approx(np.full(8000, 4.0))  # to its very ends
+
+
+@pytest.mark.parametrize(("share", "frequency"), [(1.5, 8.0), (0.3, 2.0)])
+def test_forces_are_compared_as_far_as_all_but_a_two_thousandth_of_their_power(share: float, frequency: float) -> None:
+    low = np.sin(2.0 * np.pi * 2.0 * FINE)
+    force = low + np.sqrt(share * (1.0 - FORCE_SHARE)) * np.sin(2.0 * np.pi * 8.0 * FINE)
+    for noise in (0.0, 0.05):
+        r = record(FINE, f=force + noise * white(3, 8000))
+        if noise == 0.0 or share > 1.0:
+            assert highest_frequency(["f"], [r]) == pytest.approx(frequency, abs=0.75)
+    assert highest_frequency(["f"], [record(FINE, f=low), r]) == highest_frequency(["f"], [r])
+    assert highest_frequency(["f"], [record(FINE, f=np.ones(8000))]) == pytest.approx(5.0 / FINE[-1])
+    fast = record(FINE, f=np.sin(2.0 * np.pi * 400.0 * FINE))
+    assert highest_frequency(["f"], [fast]) == pytest.approx(200.0)
+
+
+def model_of_speed(u: Any, p: Any) -> Any:
+    return p.c * u.velocity
+
+
+@pytest.mark.parametrize("model", [None, model_of_speed])
+def test_motion_is_differentiated_until_its_noise_is_next_to_nothing_beside_it(model: Any) -> None:
+    order = 2 if model is None else 1
+    system = mover()
+    if model is not None:
+        system = System("mover", "force", model, {"f": "N"}, position="x", parameters=[unknown("c", 1.0, "-")])
+    dt, f0 = FINE[1], 3.0
+
+    def limit(sigma: float) -> float:
+        x = np.sin(2.0 * np.pi * f0 * FINE)
+        return differentiated_to(system, [record(FINE, x=x + sigma * white(5, 8000), f=x)], 4.0)
+
+    assert limit(0.0) == FLAT_TO * 4.0
+    assert limit(10.0) == 4.0
+    # the noise of 2 sigma^2 dt a Hz, times f^(2 order), has up to f the share of the motion that does not count
+    n = 2 * order + 1
+    wanted = 8.0
+    sigma = np.sqrt((1.0 - FORCE_SHARE) * 0.5 * f0 ** (2 * order) * n / wanted**n / (2.0 * dt))
+    assert limit(sigma) == pytest.approx(wanted, rel=0.12)
+
+
+@pytest.mark.parametrize(("position", "velocity"), [("x", None), ("x", "v"), (None, "v")])
+@pytest.mark.parametrize("cutoff", [None, 20.0])
+def test_motion_is_that_of_which_some_was_measured(
+    position: str | None, velocity: str | None, cutoff: float | None
+) -> None:
+    w = 2.0 * np.pi * 1.5
+    x, v, a = np.cos(w * FINE), -w * np.sin(w * FINE), -(w**2) * np.cos(w * FINE)
+    system = mover(position=position, velocity=velocity)
+    got = motion(system, record(FINE, x=x, v=v, f=x), cutoff)
+    inner = slice(200, -200)
+    assert got[0][inner] == pytest.approx(x[inner] - (0.0 if position else 1.0), abs=2e-3)
+    assert got[1][inner] == pytest.approx(v[inner], abs=2e-3 * w)
+    if cutoff is None:
+        assert not got[2].any() and len(got[2]) == 8000
+    else:
+        assert got[2][inner] == pytest.approx(a[inner], abs=5e-3 * w**2)
+
+
+def test_a_displacement_is_smoothed_above_all_that_moves_it() -> None:
+    x = np.sin(2.0 * np.pi * 3.0 * FINE) + 0.1 * np.sin(2.0 * np.pi * 20.0 * FINE)
+    got = smoothed(FINE, put(x + 0.001 * white(6, 8000), 3000))
+    inner = slice(300, -300)
+    assert got[inner] == pytest.approx(x[inner], abs=4e-3)
+    hiss = np.sin(2.0 * np.pi * 300.0 * FINE)
+    assert smoothed(FINE, x + 0.002 * hiss)[inner] == pytest.approx(x[inner], abs=5e-4)  # a twentieth of the rate
+
+
+# ---- a curve at each place -------------------------------------------------------------------------------------------
+
+Q = np.linspace(0.2, 1.4, 60)  # the input, and the other column is its square root
+
+
+def two(u: Any, p: Any) -> Any:
+    return p.a * u.u + p.b, p.a * u.u - p.b
+
+
+def curved_system(**more: Any) -> System:
+    given: dict[str, Any] = {
+        "outputs": {"y": "V", "z": "V"}, "inputs": {"u": "A"},
+        "parameters": [unknown("a", 2.0, "V/A"), unknown("b", 0.5, "V")],
+    }  # fmt: skip
+    return System("two", "static", two, **given | more)
+
+
+def learned(how: str, at: str, of: str, form: str = "line", **more: Any) -> Learned:
+    given: dict[str, Any] = {"low": -10.0, "high": 10.0, "values": [0.3], "unit": "1", "form": form}
+    return Learned(how=how, at=at, of=of, **given | more)
+
+
+def held_against(system: System, curve: Learned, log: Record) -> tuple[BoundSystem, Array]:
+    """A system with a curve, and its parameters with the curve as it was learned."""
+    bound = BoundSystem(system, [log], curves={"c": curve})
+    theta = bound.stage.neutral()
+    theta[: len(system.parameters)] = [p.value for p in system.parameters]
+    theta[bound.stage.index()["c"]] = curve.values
+    return bound, theta
+
+
+LOG = record(u=Q, y=2.0 * Q + 0.5, z=2.0 * Q - 0.5, w=np.sqrt(Q))
+A, B = 2.0, 0.5
+WORTH = {
+    "u": Q, "w": np.sqrt(Q), "time": T, "u_minus_w": Q - np.sqrt(Q), "z": A * Q - B, "time_every_1700_ms": T % 1.7,
+    "w_every_0p3": np.sqrt(Q) % 0.3, "direction_of_u": put(np.ones(60), [0, 1], 0.0), "w_lagged_by_1_ms": np.sqrt(Q),
+}  # fmt: skip
+PLACES = (
+    ("parameter times", "b"), ("input adds", "u"), ("input times", "u"), ("output adds", "z"), ("output times", "y"),
+)  # fmt: skip
+
+
+def test_a_curve_changes_what_it_is_at_by_its_value() -> None:
+    curves = {
+        f"c{k}{m}": learned(how, at, of)
+        for k, (how, at) in enumerate(PLACES)
+        for m, of in enumerate(WORTH)
+        if of != "z" or how.startswith("output")  # an output is not known before the model runs
+    }
+    bound = BoundSystem(curved_system(), [LOG], curves=curves)
+    neutral = bound.stage.neutral()
+    for name, curve in curves.items():
+        theta, c, how = neutral.copy(), 0.3 * WORTH[curve.of], curve.how
+        theta[bound.stage.index()[name]] = 0.3
+        u = Q + c if how == "input adds" else Q * (1.0 + c) if how == "input times" else Q
+        b = B * (1.0 + c) if how == "parameter times" else B
+        y = (A * u + b) * (1.0 + c if how == "output times" else 1.0)
+        z = A * u - b + (c if how == "output adds" else 0.0)
+        assert bound.run(theta[None])[0] == pytest.approx(np.array([y, z]), abs=2e-4), (how, curve.of)
+    assert bound.run(neutral[None])[0] == pytest.approx(np.array([A * Q + B, A * Q - B]), rel=1e-4)
+
+
+def test_a_curve_that_jumps_and_one_of_splines_are_what_their_numbers_say() -> None:
+    jumps = learned("output adds", "y", "u_minus_w", form="sign")
+    bound, theta = held_against(curved_system(), jumps, LOG)
+    assert bound.run(theta[None])[0, 0] == pytest.approx(A * Q + B + 0.3 * np.sign(Q - np.sqrt(Q)))
+    knots = [0.0] * 4 + [2.0] * 4
+    spline = scipy.interpolate.BSpline(np.array(knots), np.array([0.1, -0.4, 0.3, 0.2]), 3)
+    cubic = learned("output adds", "y", "u", "", low=0.0, high=2.0, knots=knots, values=[0.1, -0.4, 0.3, 0.2], size=0.5)
+    bound, theta = held_against(curved_system(), cubic, LOG)
+    assert bound.run(theta[None])[0, 0] == pytest.approx(A * Q + B + spline(Q), abs=1e-4)
+    (effect,) = (e for e in bound.stage.effects if e.name == "c")
+    assert effect.starts == ((0.1, -0.4, 0.3, 0.2),) and [p.name for p in effect.parameters] == ["c1", "c2", "c3", "c4"]
+    for p in effect.parameters:  # known to be of the curve's size
+        assert (p.value, p.low, p.high, p.scale) == (0.0, -500.0, 500.0, 0.5)
+        assert p.tolerance == pytest.approx(np.sqrt(3.0) * LEVEL_SPREAD * 0.5)
+    line_of = held_against(curved_system(), learned("output adds", "y", "u", values=[-0.25]), LOG)[0].stage.effect("c")
+    assert [(p.high, p.scale, p.tolerance) for p in line_of.parameters] == [(250.0, 0.25, 0.0)]
+    both = learned(
+        "output adds", "y", "u", "", low=-1.0, high=1.0, knots=[-1.0] * 4 + [1.0] * 4, values=[0.0] * 4 + [0.7],
+        jump=True,
+    )  # fmt: skip
+    log = record(u=Q - 0.8, y=A * (Q - 0.8) + B, z=A * (Q - 0.8) - B)
+    bound, theta = held_against(curved_system(), both, log)
+    assert bound.run(theta[None])[0, 0] == pytest.approx(A * (Q - 0.8) + B + 0.7 * np.sign(Q - 0.8))
+
+
+def test_a_surface_is_the_product_of_what_it_is_made_of() -> None:
+    second = {"of": "w", "low": -2.0, "high": 2.0, "form": "line"}
+    bound, theta = held_against(
+        curved_system(), learned("output adds", "y", "u", low=-4.0, high=4.0, second=second), LOG
+    )
+    assert bound.run(theta[None])[0, 0] == pytest.approx(A * Q + B + 0.3 * Q * np.sqrt(Q), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("curve", "said"),
+    [
+        (
+            learned("somehow", "y", "u"),
+            "how (='somehow') is not one of system 'two'; allowed: parameter times, input adds, input times, state "
+            "adds, output adds, output times, force adds",
+        ),
+        (learned("output adds", "u", "u"), "at (='u') is not one of system 'two'; allowed: y, z"),
+        (
+            learned("force adds", "y", "u"),
+            "at (='y') is not one of system 'two'; allowed: nothing, with how = 'force adds'",
+        ),
+        (
+            learned("output adds", "y", "v"),
+            "of (='v') is not one of system 'two'; allowed: y, z, u, time, w",
+        ),
+    ],
+)  # fmt: skip
+def test_a_curve_that_the_system_cannot_have_gets_one_line(curve: Learned, said: str) -> None:
+    with pytest.raises(StageError) as e:
+        BoundSystem(curved_system(), [LOG], curves={"c": curve})
+    assert str(e.value) == f"curves.c: {said}"
+
+
+# ---- a system and its logs -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("given", [1.0, 0.0, -3.0])
+def test_unknown_parameters_begin_at_least_squares_and_may_move_by_some_of_their_sizes(given: float) -> None:
+    y = put(2.5 * Q + 0.75 + 0.01 * white(3, 60), 7)
+    parameters = [unknown("a", given, "V/A"), unknown("b", 0.0, "V", -1.0, 1.0)]
+    bound = BoundSystem(mapping(model=lambda u, p: p.a * u.u + p.b, parameters=parameters), [record(u=Q, y=y)])
+    there = np.isfinite(y)
+    best = np.linalg.lstsq(np.stack([Q[there], np.ones(59)], axis=1), y[there], rcond=None)[0]
+    a, b = bound.stage.parameters
+    assert (a.value, b.value) == pytest.approx(tuple(best), rel=1e-5)
+    size = max(abs(a.value), abs(given))
+    assert a.tolerance == pytest.approx(max(WIDE * size, GIVEN * abs(given)))
+    assert a.scale == pytest.approx(WIDE * max(abs(a.value), 0.1 * size))
+    spread = np.nanstd(y)  # of what was given as 0: the size that moves the output by as much as it varies
+    assert b.tolerance == pytest.approx(WIDE * max(abs(b.value), spread), rel=0.05)
+    assert (b.low, b.high) == (-1.0, 1.0)
+    assert bound.floor == pytest.approx(bound.data.noise())  # inputs are taken as they are
+    assert bound.errors(bound.stage.neutral())["log"][0] == pytest.approx(a.value * Q + b.value - y, nan_ok=True)
+
+
+def test_a_known_parameter_stays_and_one_at_its_bound_stays_within() -> None:
+    parameters = [Parameter("a", 2.0, "V/A"), unknown("b", 1.0, "V", 0.5, 3.0)]
+    system = mapping(model=lambda u, p: p.a * u.u + p.b, parameters=parameters)
+    bound = BoundSystem(system, [record(u=Q, y=2.0 * Q)])
+    assert bound.stage.parameters[0] == parameters[0] and bound.stage.parameters[1].value == pytest.approx(0.5)
+    again = BoundSystem(system, [record(u=Q, y=2.0 * Q)], values={"b": 9.0})
+    assert again.stage.parameters[1].value == 3.0
+    with pytest.raises(StageError) as e:
+        BoundSystem(system, [record(u=Q, y=Q)], values={"g": 1.0})
+    assert str(e.value) == "model file: parameter 'g' is not one of system 'map'; allowed: a, b"
+    with pytest.raises(StageError, match=r"^model file: effect 'u\.wrong' is not one that system 'map' can have; it"):
+        BoundSystem(system, [record(u=Q, y=Q)], present={"u.wrong": {}})
+    with pytest.raises(StageError) as e:
+        BoundSystem(system, [record(u=Q, y=Q)], present={"u.cubic": {"b": 1.0}})
+    assert str(e.value) == "model file: effect 'u.cubic' needs a number for coefficient"
+    with pytest.raises(StageError, match=r"^without 'u\.wrong': not a law that system 'map' can have; it has u\."):
+        BoundSystem(mapping(without=["u.wrong"]), [record(u=Q, y=Q)])
+
+
+def test_the_other_valley_of_an_error_is_begun_from_too() -> None:
+    system = mapping(model=lambda u, p: p.a**2 * u.u, parameters=[unknown("a", 0.0, "-")])
+    bound = BoundSystem(system, [record(u=Q, y=4.0 * Q + 0.01 * white(1, 60))])
+    assert bound.stage.begins is not None and bound.others
+    values = sorted(float(begin[0]) for begin in bound.stage.begins)
+    assert values[0] == pytest.approx(-2.0, rel=0.01) or values[-1] == pytest.approx(2.0, rel=0.01)
+    assert abs(bound.stage.parameters[0].value) == pytest.approx(2.0, rel=0.01)
+    assert float(bound.others[0][0]) == pytest.approx(-bound.stage.parameters[0].value, rel=0.01)
+
+
+def test_laws_of_a_model_file_are_part_of_the_model_and_not_looked_for() -> None:
+    log = record(u=Q, y=2.0 * (Q + 0.3 * Q**3))
+    bound = BoundSystem(mapping(), [log], values={"a": 2.0}, present={"u.cubic": {"coefficient": 0.3}})
+    (a, law) = bound.stage.parameters
+    assert a.value == pytest.approx(2.0) and (law.name, law.value) == ("u.cubic.coefficient", 0.3)
+    assert "u.cubic" not in [e.name for e in bound.stage.effects] and "u.bias" in [e.name for e in bound.stage.effects]
+    assert bound.errors(bound.stage.neutral())["log"] == pytest.approx(np.zeros((1, 60)), abs=1e-4)
+    assert law.tolerance == pytest.approx(WIDE * law.scale / 0.1) and law.low < 0.3 < law.high
+    left = BoundSystem(mapping(without=["u.bias"]), [log])
+    assert "u.bias" not in [e.name for e in left.stage.effects]
+    assert all(h[0] != "u.bias" for e in left.stage.effects for h in e.holds)
+
+
+def test_a_position_that_no_log_tells_is_fitted_to_each_log() -> None:
+    """A spring about the middle: its force tells where the motion, of which the rate was measured, began."""
+    system = System(
+        "spring", "force", lambda u, p: p.k * u.position, {"f": "N"}, velocity="v",
+        parameters=[unknown("k", 1.0, "N/m")],
+    )  # fmt: skip
+    t = 0.01 * np.arange(600)
+    x = np.cos(2.0 * t)
+
+    def log(name: str, begin: float) -> Record:
+        return record(t, name, v=-2.0 * np.sin(2.0 * t), f=3.0 * (x - x[0] + begin))
+
+    bound = BoundSystem(system, [log("one", 1.0), log("two", -0.4)])
+    named = {p.name: p.value for p in bound.stage.parameters}
+    assert named == pytest.approx({"k": 3.0, "start_position_1": 1.0, "start_position_2": -0.4}, rel=1e-3)
+    test = BoundSystem(system, [log("three", 0.7)], like=bound)
+    theta = test.theta_from(bound, bound.stage.neutral())
+    assert theta[:2] == pytest.approx([3.0, 0.7], rel=1e-3) and len(theta) == len(test.stage.neutral())
+    assert np.abs(test.errors(theta)["three"]).max() < 0.01
+
+
+# ---- a simulated system, in plain Python -----------------------------------------------------------------------------
+
+SHORT = 0.08 * np.arange(50)
+NUMBERS = {"one": 1.0, "none": None}  # of a kind that no compiler takes
+
+
+def decay(x: Any, u: Any, p: Any) -> Any:
+    return u.u - NUMBERS["one"] * p.c * x.y
+
+
+def driven_decay(seed: int, begin: float, c: float = 0.8) -> Record:
+    """A first-order lag of an input that holds, exactly."""
+    u, y = np.repeat(white(seed, 5), 10), np.empty(50)
+    y[0] = begin
+    for k in range(1, 50):
+        y[k] = u[k - 1] / c + (y[k - 1] - u[k - 1] / c) * np.exp(-c * 0.08)
+    return record(SHORT, f"run {seed}", u=u, y=y)
+
+
+@pytest.fixture(scope="module")
+def lag() -> BoundSystem:
+    system = System(
+        "lag", "simulate", decay, {"y": "V"}, {"u": "V"}, [unknown("c", 0.5, "1/s")], states={"y": "V"},
+        start={"y": "fitted"}, places=["y"],
+    )  # fmt: skip
+    return BoundSystem(system, [driven_decay(1, 0.7), driven_decay(2, -1.2)])
+
+
+def test_a_model_that_numba_cannot_compile_runs_as_plain_python_and_is_fitted_with_its_starts(lag: BoundSystem) -> None:
+    (note,) = [n for n in lag.notes if "numba" in n]
+    assert note.startswith("system 'lag': numba cannot compile the model (")
+    assert note.endswith("); it runs as plain Python, some 100 times slower")
+    named = {p.name: (p.value, p.unit) for p in lag.stage.parameters}
+    assert list(named) == ["c", "start_y_1", "start_y_2"] and named["c"][1] == "1/s" and named["start_y_2"][1] == "V"
+    assert [v for v, _ in named.values()] == pytest.approx([0.8, 0.7, -1.2], abs=2e-3)
+    size = np.std(lag.data.y[1])
+    assert lag.stage.parameters[2].tolerance >= WIDE * 1.2 and lag.stage.parameters[2].tolerance >= WIDE * size
+    error = lag.errors(lag.stage.neutral())
+    assert list(error) == ["run 1", "run 2"] and max(float(np.abs(e).max()) for e in error.values()) < 5e-3
+    effects = {e.name for e in lag.stage.effects}
+    assert {"y.leak", "y_sensor.bias"} <= effects and not any(n.startswith("u.") for n in effects)
+
+
+def test_a_set_of_parameters_is_run_with_what_every_law_adds(lag: BoundSystem) -> None:
+    theta = lag.stage.neutral()
+    theta[:3] = 0.8, 0.7, -1.2
+    exact = lag.measured[0]
+    index = lag.stage.index()
+    assert lag.run(theta[None])[0, 0] == pytest.approx(exact, abs=1e-3)
+    assert lag.run(theta[None], 7)[0, 0] == pytest.approx(exact[::7], abs=1e-3)
+    biased = theta.copy()
+    biased[index["y_sensor.bias"]] = 0.25
+    assert lag.run(np.array([theta, biased]))[:, 0] == pytest.approx(np.array([exact, exact + 0.25]), abs=1e-3)
+    leaking = theta.copy()
+    leaking[0] = 0.5
+    leaking[index["y.leak"]] = 0.3  # as much more of the same
+    assert lag.run(leaking[None])[0, 0] == pytest.approx(exact, abs=1e-3)
+    gone = theta.copy()
+    gone[0] = -400.0
+    far = 100.0 * np.abs(exact).max()
+    assert np.abs(lag.run(gone[None])).max() == pytest.approx(far)
+
+
+# ---- what several logs say -------------------------------------------------------------------------------------------
+
+
+def by_hand(columns: list[Array], y: Array) -> Array:
+    """Errors of the least-squares fit of a straight sum of columns."""
+    a = np.stack(columns, axis=1)
+    return np.asarray(a @ np.linalg.lstsq(a, y, rcond=None)[0] - y)
+
+
+def rms(x: Array) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+@pytest.fixture(scope="module")
+def answer() -> tuple[Logs, StageDiagnosis, ByLog]:
+    """Two logs of a gain with a cubic and an offset, and one that tests it."""
+    u = [np.sin(T) + 0.2, 1.2 * np.cos(0.7 * T), 1.1 * np.sin(1.3 * T)]
+    logs = [record(name=f"log {k}", u=x, y=2.0 * (x + 0.2 * x**3) + 0.5 + 0.01 * white(k, 60)) for k, x in enumerate(u)]
+    every = [e.name for e in BoundSystem(mapping(), logs).effects]
+    system = mapping(without=[name for name in every if name not in ("u.cubic", "y.bias")])
+    found = bind(system, logs[:2], [put_last(logs[2])])
+    d = diagnose_stage(found.fitted.thinned, found.fitted.floor, judged=found.judged())
+    return found, d, ByLog.of(found, d)
+
+
+def put_last(log: Record) -> Record:
+    """The same without its last reading."""
+    return record(log.t, log.name, u=log.columns["u"], y=put(log.columns["y"], -1))
+
+
+def test_the_waterfall_is_told_log_by_log_as_least_squares_has_it(answer: tuple[Logs, StageDiagnosis, ByLog]) -> None:
+    logs, d, by = answer
+    assert sorted(d.final.effects) == ["u.cubic", "y.bias"]
+    assert list(by.steps) == ["model", d.final.effects[0], " + ".join(d.final.effects)]
+    assert list(by.steps["model"]) == ["log 0", "log 1", "log 2"]
+    u, y = np.concatenate(logs.fitted.data.u, axis=1)[0], logs.fitted.measured[0]
+    bare, best = by_hand([u], y), by_hand([u, u**3, np.ones(120)], y)
+    last = by.steps[" + ".join(d.final.effects)]
+    for k in range(2):
+        at = slice(60 * k, 60 * k + 60)
+        assert by.steps["model"][f"log {k}"] == pytest.approx([rms(bare[at])], rel=0.01)
+        assert last[f"log {k}"] == pytest.approx([rms(best[at])], rel=0.01)
+    assert last["log 2"] == pytest.approx([0.01], rel=0.4)
+    together = by.together()
+    assert together["model"]["fitted"] == pytest.approx([rms(bare)], rel=0.01)
+    assert together["model"]["test"] == by.steps["model"]["log 2"]
+    rows = by.rows()
+    assert [r[:3] for r in rows] == [
+        ("log 0", "fitted", 0), ("log 1", "fitted", 0), ("log 2", "test", 0), ("all 2 together", "fitted", 0),
+    ]  # fmt: skip
+    assert rows[0][3] == [float(step["log 0"][0]) for step in by.steps.values()]
+    assert rows[3][3] == [float(step["fitted"][0]) for step in together.values()]
+    assert [r[4] for r in rows[:2]] == pytest.approx([rms(y[:60]), rms(y[60:])]) and rows[3][4] == pytest.approx(rms(y))
+    floor = np.array([0.005])
+    assert by.tested(floor) == {"log 2": pytest.approx(last["log 2"][0] / 0.005)}
+    assert by.tested(np.array([0.5])) == {"log 2": 1.0}
+    assert by.tested() == {"log 2": pytest.approx(max(last["log 2"][0] / logs.fitted.floor[0], 1.0))}
+
+
+def test_what_a_law_brings_is_the_error_with_it_over_that_without(answer: tuple[Logs, StageDiagnosis, ByLog]) -> None:
+    logs, d, by = answer
+    u, y = np.concatenate(logs.fitted.data.u, axis=1)[0], logs.fitted.measured[0]
+    without = {"u.cubic": by_hand([u, np.ones(120)], y), "y.bias": by_hand([u, u**3], y)}
+    last = list(by.steps.values())[-1]
+    assert by.ablation.keys() == without.keys()
+    for name, error in without.items():
+        for k in range(2):
+            of_log = rms(error[60 * k : 60 * k + 60])
+            assert by.ablation[name][f"log {k}"] == pytest.approx(last[f"log {k}"][0] / of_log, rel=0.05)
+    assert by.model.meta == {"system": "map"}
+    assert by.model.parameters == {"a": pytest.approx(2.0, rel=0.01)}
+    assert by.model.effects["u.cubic"]["coefficient"] == pytest.approx(0.2, rel=0.05)
+    assert by.model.effects["y.bias"]["offset"] == pytest.approx(0.5, rel=0.05)
+    share = 100.0 * d.error_after[0] / rms(y)
+    assert by.sentence() == (
+        f"y is left with an error of {d.error_after[0]:.4g} V ({share:.2g} % of its RMS), {d.excess:.3g} times the "
+        "noise of its samples"
+    )
+    (a,) = by.parameters()
+    assert (a["parameter"], a["unit"]) == ("a", "V/A") and float(str(a["low"])) < 2.0 < float(str(a["high"]))
+    data = by.json()
+    assert data["recalibrated"] == [] and len(data["logs"]) == 9 and len(data["together"]) == 6
+    assert data["logs"][0]["relative"] == pytest.approx(by.steps["model"]["log 0"][0] / rms(y[:60]))
+    assert {(e["effect"], e["log"]): e["helps"] for e in data["ablation"]} == {
+        (e, log): v < NO_HELP for e, of in by.ablation.items() for log, v in of.items()
+    }
+
+
+@pytest.mark.parametrize(("ratio", "said"), [(0.84, ""), (0.9, "hardly helps"), (0.99, "does not help")])
+def test_a_law_that_does_not_help_on_a_log_is_said(
+    answer: tuple[Logs, StageDiagnosis, ByLog], ratio: float, said: str
+) -> None:
+    logs, d, _ = answer
+    by = ByLog(logs, d, ablation={"u.cubic": {"log 2": ratio}})
+    by._remark(LeastSquaresProblem(logs.fitted.thinned, d.floor))
+    helps = [n for n in by.notes if "help" in n]
+    wanted = f"u.cubic {said} on log 2: error with it over error without it is {ratio:.2f}"
+    assert helps == ([wanted] if said else [])
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_force_that_drives_against_the_motion_is_said(sign: float) -> None:
+    t = 0.01 * np.arange(400)
+    v = np.cos(2.0 * t)
+    system = System(
+        "damper", "force", lambda u, p: p.c * u.velocity, {"f": "N"}, velocity="v", position="x",
+        parameters=[unknown("c", 1.0, "N s/m", 0.0, np.inf)],
+    )  # fmt: skip
+    log = record(t, x=0.5 * np.sin(2.0 * t), v=v, f=sign * 3.0 * v + 0.01 * white(1, 400))
+    logs = bind(system, [log])
+    judge = LeastSquaresProblem(logs.fitted.thinned, logs.fitted.floor)
+    d = as_given(logs, judge.fit((), logs.fitted.stage.neutral()))
+    said = parameter_warnings(logs.fitted, judge, d)
+    turned = "is a sign the other way round?"
+    assert said == (
+        [] if sign > 0.0 else [
+            f"c stands at its bound, 0 N s/m: the logs would have it go beyond; {turned}",
+            "log: f acts against the motion, so that the machine gives power; friction is looked for where a positive "
+            f"force drives positive motion: {turned}",
+        ]
+    )  # fmt: skip
+
+
+# ---- the next run ----------------------------------------------------------------------------------------------------
+
+
+def straight_line() -> BoundSystem:
+    system = mapping(
+        model=lambda u, p: p.a * u.u + p.b, parameters=[unknown("a", 1.0, "V/A"), unknown("b", 1.0, "V")], places=["u"],
+    )  # fmt: skip
+    u = 0.6 + 0.3 * np.sin(T)
+    return BoundSystem(system, [record(T + 3.0, u=u, y=2.0 * u + 1.0 + 0.01 * white(4, 60))])
+
+
+def test_every_shape_uses_its_range_about_the_middle() -> None:
+    bench = _Bench(straight_line(), Limits({"u": (-1.0, 3.0)}, seconds=30.0))
+    assert bench.t == pytest.approx(0.1 * np.arange(301)) and bench.sets == {"u": "A"}
+    assert bench.first == {"y": bench.bound.measured[0, 0]}
+    for name, shape in SHAPES.items():
+        for size in (1.0, 0.5):
+            u = bench.of_shape(shape, size)["u"]
+            part = 0.1 if "small" in name else 1.0
+            assert np.abs(u - 1.0).max() <= 2.0 * size * part + 1e-9
+            assert np.abs(u - 1.0).max() >= 1.8 * size * part and abs(np.mean(u) - 1.0) < 0.5 * size * part, name
+    turns = {
+        "one slow ramp up and down": 1, "five ramps up and down": 9, "small reversals about the middle": 23,
+        "swept sine to 40 cycles a run": 41,
+    }  # fmt: skip
+    for name, many in turns.items():
+        values = SHAPES[name](np.linspace(0.0, 1.0, 20001))
+        assert np.count_nonzero(np.diff(np.sign(np.diff(values))) != 0) == pytest.approx(many, abs=1), name
+        assert values[0] == pytest.approx(0.0 if "sine" in name else -np.abs(values).max(), abs=1e-6)
+    assert len(set(np.round(SHAPES["stairs up and down with dwells"](np.linspace(0, 1, 999)), 9))) == 9
+    levels = SHAPES["30 steps between the ends at random"](np.linspace(0.0, 1.0, 3001))
+    assert set(levels) == {-1.0, 1.0} and set(np.flatnonzero(np.diff(levels)) % 100) <= {99, 0}
+
+
+def test_a_shift_moves_one_part_of_a_channel_within_its_range() -> None:
+    bench = _Bench(straight_line(), Limits({"u": (-1.0, 3.0)}, seconds=24.0))
+    run = {"u": np.full(len(bench.t), 1.0)}
+    rng, part, heights = np.random.default_rng(0), len(bench.t) // 24, []
+    hat = scipy.signal.windows.triang(part)  # as the inputs of this system do not hold
+    for _ in range(40):
+        moved = bench.shifted(run, rng)["u"] - 1.0
+        at = np.flatnonzero(moved)
+        assert len(at) == at[-1] - at[0] + 1 == part
+        heights.append(moved[at[0]] / hat[0])
+        assert moved[at] == pytest.approx(np.clip(heights[-1] * hat, -2.0, 2.0))
+    assert 3.0 < max(heights) <= 4.0 and -4.0 <= min(heights) < -3.0 and run["u"].tolist() == [1.0] * len(bench.t)
+    slow = _Bench(straight_line(), Limits({"u": (-1.0, 3.0)}, {"u": 0.5}))
+    u = slow.of_shape(SHAPES["30 steps between the ends at random"], 1.0)["u"]
+    assert np.abs(np.diff(u)).max() == pytest.approx(0.05)
+
+
+def test_a_simulated_run_has_the_noise_of_its_draw_and_keeps_the_limits() -> None:
+    bound = straight_line()
+    bench = _Bench(bound, Limits({"u": (-1.0, 3.0), "y": (-1.5, 7.0)}))
+    theta = np.concatenate([[2.0, 1.0], bound.stage.neutral()[2:]])
+    u = np.linspace(-1.0, 3.0, len(bench.t))
+    clean = bench.simulated({"u": u}, theta, np.array([0.2]), 0)
+    assert clean is not None and clean.measured[0] == pytest.approx(2.0 * u + 1.0)
+    one, two, again = (bench.simulated({"u": u}, theta, np.array([0.2]), k) for k in (1, 2, 1))
+    assert one is not None and two is not None and again is not None
+    assert rms(one.measured - clean.measured) == pytest.approx(0.2, rel=0.25)
+    assert not np.array_equal(one.measured, two.measured) and np.array_equal(one.measured, again.measured)
+    assert bench.simulated({"u": u + 0.01}, theta, np.ones(1), 0) is None
+    assert bench.simulated({"u": u - 0.3}, theta, np.ones(1), 0) is None
+
+
+def test_a_run_tells_the_parameters_as_their_information_says() -> None:
+    bound = straight_line()
+    d = diagnose_stage(bound.thinned, bound.floor, judged=Logs(bound, None).judged())
+    assert d.effects == []
+    bench = _Bench(bound, Limits({"u": (-1.0, 1.0)}))
+    parameters = _Parameters(bench, d)
+    run = {"u": np.where(np.arange(len(bench.t)) % 2, 1.0, -1.0)}
+    of_log, of_run = (
+        np.linalg.slogdet(np.stack([np.ones(len(u)), u]) @ np.stack([np.ones(len(u)), u]).T)[1]
+        for u in (bound.data.u[0][0], run["u"])
+    )
+    (told,) = parameters.told(run) or [np.nan]
+    assert told == pytest.approx((of_run - of_log) / 4.0, abs=0.02)
+    assert parameters.row(told) == pytest.approx(np.exp(-told))
+    assert parameters.told({"u": np.zeros(len(bench.t))}) is None  # nothing of a slope
+    checked = parameters.checked(run, [0])
+    words = re.fullmatch(r"4 simulated runs with noise scatter (.*) times as far as their errors say", checked)
+    assert words is not None and 0.3 < float(words[1]) < 2.0
+    assert parameters.text("ramps", told, 5.9, checked, [0]) == (
+        f"No rivals are left. For the parameters: ramps, 5.9 s; standard errors are {np.exp(-told):.2f} times those of "
+        f"the log; {checked}."
+    )
