@@ -23,12 +23,15 @@ from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.by_log import ByLog, Logs, as_given, bind, parameter_warnings
 from vaneloop.identification.user_models.data import Data, noise_of_channel, noise_of_neighbours, without_order
 from vaneloop.identification.user_models.experiment import SHAPES, Limits, _Bench, _Parameters
+from vaneloop.identification.user_models.hysteresis_regressors import forgotten, swings
 from vaneloop.identification.user_models.motion import differentiated_to, highest_frequency, low_pass, motion, smoothed
+from vaneloop.identification.user_models.user_code import cannot
+from vaneloop.identification.user_models.user_laws import Law
 
 # docs/settings.md
 LEAST_SAMPLES, LEAST_POINTS, INPUT_NAN = 50, 12, 0.2
 FORCE_SHARE, FLAT_TO, MOVES = 0.9995, 3.0, 0.3
-WIDE, GIVEN = 4.0, 12.0
+WIDE, GIVEN, START_WITHIN = 4.0, 12.0, 3.0
 NO_HELP = 0.85
 
 T = 0.1 * np.arange(60)  # s
@@ -671,6 +674,7 @@ def test_what_a_law_brings_is_the_error_with_it_over_that_without(answer: tuple[
     )
     (a,) = by.parameters()
     assert (a["parameter"], a["unit"]) == ("a", "V/A") and float(str(a["low"])) < 2.0 < float(str(a["high"]))
+    assert parameter_warnings(logs.fitted, LeastSquaresProblem(logs.fitted.thinned, d.floor), d) == []
     data = by.json()
     assert data["recalibrated"] == [] and len(data["logs"]) == 9 and len(data["together"]) == 6
     assert data["logs"][0]["relative"] == pytest.approx(by.steps["model"]["log 0"][0] / rms(y[:60]))
@@ -802,3 +806,180 @@ def test_a_run_tells_the_parameters_as_their_information_says() -> None:
         f"No rivals are left. For the parameters: ramps, 5.9 s; standard errors are {np.exp(-told):.2f} times those of "
         f"the log; {checked}."
     )
+
+
+# ---- states and curves in a simulation -------------------------------------------------------------------------------
+
+
+def pair(x: Any, u: Any, p: Any) -> Any:
+    """Two lags that forget slowly, each measured."""
+    return u.u - NUMBERS["one"] * p.c * x.y, -0.02 * x.z
+
+
+def pair_of(c: float) -> BoundSystem:
+    system = System(
+        "pair", "simulate", pair, {"y": "V", "z": "A"}, {"u": "V"}, [Parameter("c", c, "1/s")],
+        states={"y": "V", "z": "A"}, places=["u"], without=[],
+    )  # fmt: skip
+    log = driven_decay(1, 0.7, c)
+    z = 3.0 * np.exp(-0.02 * SHORT)
+    noise = 0.05 * white(5, 50), 0.02 * white(6, 50)
+    return BoundSystem(system, [record(SHORT, u=log.columns["u"], y=log.columns["y"] + noise[0], z=z + noise[1])])
+
+
+def test_a_state_that_a_system_forgets_slowly_starts_within_its_sensor_s_noise() -> None:
+    bound = pair_of(0.01)
+    assert bound.read_starts
+    named = {p.name: p for p in bound.stage.parameters}
+    assert list(named) == ["c", "start_y", "start_z"]
+    for k, name in enumerate(("y", "z")):
+        p = named[f"start_{name}"]
+        assert p.value == bound.measured[k, 0] and p.log == 1 and p.unit == "VA"[k]
+        assert p.tolerance == pytest.approx(START_WITHIN * bound.data.noise()[k])
+    assert np.all(bound.floor >= bound.data.noise())
+    test = BoundSystem(bound.system, bound.data.records, like=bound)
+    assert [p.name for p in test.stage.parameters] == list(named)
+
+
+def test_a_state_that_a_system_forgets_at_once_starts_at_its_reading() -> None:
+    system = System(
+        "lag", "simulate", decay, {"y": "V"}, {"u": "V"}, [Parameter("c", 8.0, "1/s")], states={"y": "V"}, places=["u"],
+    )  # fmt: skip
+    log = driven_decay(1, 0.7, 8.0)
+    bound = BoundSystem(system, [record(SHORT, u=log.columns["u"], y=log.columns["y"] + 0.02 * white(5, 50))])
+    assert not bound.read_starts and [p.name for p in bound.stage.parameters] == ["c"]
+
+
+@pytest.fixture(scope="module")
+def lag_with_curves() -> BoundSystem:
+    curves = {
+        "drain": learned("state adds", "y", "y", values=[0.5]),
+        "slower": learned("parameter times", "c", "time", form="constant", values=[-0.25]),
+        "more": learned("input times", "u", "time", form="constant", values=[0.5]),
+        "both": learned(
+            "state adds", "y", "y", low=-20.0, high=20.0, values=[0.1],
+            second={"of": "time", "low": 0.0, "high": 40.0, "form": "line"},
+        ),
+    }  # fmt: skip
+    system = System(
+        "lag", "simulate", decay, {"y": "V"}, {"u": "V"}, [Parameter("c", 0.8, "1/s")], states={"y": "V"},
+        start={"y": 0.7}, places=["u"],
+    )  # fmt: skip
+    return BoundSystem(system, [driven_decay(1, 0.7)], curves=curves)
+
+
+def integrated(rate: Any, u: Array, begin: float) -> Array:
+    """A state by a reference integrator, between samples at which its input steps."""
+    y = [begin]
+    for k in range(len(SHORT) - 1):
+        got = scipy.integrate.solve_ivp(
+            lambda t, x, k=k: rate(t, x, u[k]), SHORT[k : k + 2], [y[-1]], rtol=1e-8, atol=1e-10
+        )
+        y.append(float(got.y[0, -1]))
+    return np.array(y)
+
+
+@pytest.mark.parametrize(
+    ("curve", "rate"),
+    [
+        ("", lambda t, x, u: u - 0.8 * x),
+        ("drain", lambda t, x, u: u - 1.3 * x),
+        ("slower", lambda t, x, u: u - 0.6 * x),
+        ("more", lambda t, x, u: 1.5 * u - 0.8 * x),
+        ("both", lambda t, x, u: u - 0.8 * x - 0.1 * x * t),
+    ],
+)
+def test_a_curve_in_a_simulation_is_that_term_of_its_equation(
+    lag_with_curves: BoundSystem, curve: str, rate: Any
+) -> None:
+    bound = lag_with_curves
+    theta = bound.stage.neutral()
+    if curve:
+        theta[bound.stage.index()[curve]] = bound.stage.effect(curve).starts[0]
+    wanted = integrated(rate, bound.data.u[0][0], 0.7)
+    assert bound.run(theta[None])[0, 0] == pytest.approx(wanted, abs=4e-3 * np.abs(wanted).max())
+
+
+def test_what_a_channel_did_before_the_log_is_forgotten_once_the_rest_of_the_curve_is_flat() -> None:
+    q = np.concatenate([np.linspace(0.0, 1.0, 11), np.linspace(0.9, -3.0, 40)])
+    table = np.minimum(np.linspace(0.0, 2.0, 21), 0.5)  # from 0.5 on it is flat, 0.475 at 0.95 of it
+    lost = forgotten(q, 2.0, table)
+    way = np.maximum.accumulate(q) - np.minimum.accumulate(q)
+    assert lost.tolist() == (0.5 * way >= 0.475 - 1e-9).tolist() and lost.any() and not lost.all()
+    assert swings(np.concatenate([q, np.linspace(-3.0, 0.0, 31)[1:]])).tolist() == [4.0] * 51 + [4.0] * 30
+    assert not swings(np.zeros(5)).any()
+
+
+def test_the_other_frequency_of_a_wave_is_found_by_drawing() -> None:
+    """From the user's own value the error falls away from the truth: drawn values come to the right valley."""
+    t = 0.02 * np.arange(200)
+    system = mapping(model=lambda u, p: np.sin(p.a * u.u), parameters=[unknown("a", 8.0, "1/s")], places=["y"])
+    bound = BoundSystem(system, [record(t, u=t, y=np.sin(3.0 * t) + 0.01 * white(1, 200))])
+    assert bound.stage.parameters[0].value == pytest.approx(3.0, rel=1e-3)
+    assert bound.stage.begins is not None and bound.stage.begins[0, 0] == 8.0  # the user's own is begun from, too
+
+
+# ---- own laws --------------------------------------------------------------------------------------------------------
+
+
+def shifted(u: Any, t: Any, p: Any) -> Any:
+    return u + NUMBERS["one"] * p.by
+
+
+def summed(u: Any, t: Any, dt: Any, p: Any, m: Any) -> Any:
+    m[0] += dt * NUMBERS["one"]
+    return u + p.rate * m[0] * p.share
+
+
+def test_own_laws_in_plain_python_do_what_they_say() -> None:
+    by = Law("shifted", "signal", shifted, [Parameter("by", 0.0, "V", -5.0, 5.0)], [-5.0, 5.0])
+    sizes = [Parameter("rate", 0.0, "V/s", -5.0, 5.0), Parameter("share", 1.0, "-", 0.0, 2.0)]
+    late = Law("summed", "signal", summed, sizes, [(0.5, 1.0), (-0.5, 2.0)], memory=1)
+    bound = BoundSystem(mapping(laws=[by, late], places=["y"]), [record(T + 2.0, u=Q, y=2.0 * Q)])
+    assert any(n.startswith("numba cannot compile law ") and n.endswith("runs as plain Python") for n in bound.notes)
+    index, theta = bound.stage.index(), bound.stage.neutral()
+    theta[index["y.shifted"]], theta[index["y.summed"]] = 0.75, (0.5, 1.5)
+    assert bound.run(theta[None])[0, 0] == pytest.approx(2.0 * Q + 0.75 + 0.75 * T, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"name": "if"}, "its name must be a Python name (letters, digits, _)"),
+        ({"on": "torque"}, "on (='torque') must be one of signal, force, state"),
+        ({"memory": 65}, "memory (=65) must be a whole number in [0, 64]"),
+        ({"memory": True}, "memory (=True) must be a whole number in [0, 64]"),
+        ({"memory": 64}, "function takes (u, t, p); a law on a signal with memory=64 is called with (u, t, dt, p, m)"),
+        ({"on": "force"}, "function takes (u, t, p); a law on a force with no memory is called with (v, x, t, p)"),
+        ({"function": 3}, "function (=3) must be a function"),
+        ({"parameters": []}, "parameters (=[]) must be a list of 1 to 8 Parameter(...)"),
+        ({"parameters": [Parameter("by", 1.0, "V", 1.0, 1.0)]}, "parameter by: low (=1) must be below high (=1)"),
+        ({"parameters": [Parameter("by", 6.0, "V", -5.0, 5.0)]}, "parameter by (=6 V) must be in [-5, 5]"),
+        ({"starts": []}, "starts is empty; give sizes from which a fit is tried, from hardly seen to gross"),
+        ({"starts": [5.1]}, "starts: by (=5.1 V) must be in [-5, 5]"),
+        ({"starts": [(1.0, 2.0)]}, "starts: (1.0, 2.0) has 2 values; 1 are needed (by)"),
+        ({"starts": [0.0]}, "starts: 0.0 is neutral, where the law changes nothing"),
+        ({"starts": ["far"]}, "starts: 'far' is not a number, nor a tuple of numbers"),
+        ({"places": "input"}, "places (='input') must be a list of names"),
+        ({"name": "bias"}, "the library has a law of that name (on a signal); choose another"),
+    ],
+)
+def test_an_own_law_that_cannot_be_gets_one_line(change: dict[str, Any], said: str) -> None:
+    good: dict[str, Any] = {
+        "name": "shifted", "on": "signal", "function": lambda u, t, p: u + p.by, "starts": [-5.0, 5.0],
+        "parameters": [Parameter("by", 0.0, "V", -5.0, 5.0)],
+    }  # fmt: skip
+    law = Law(**good)
+    assert (
+        law.sizes() == ((-5.0,), (5.0,)) and law.arguments() == ("u", "t", "p") and law.parameters[0].tolerance == 0.0
+    )
+    assert law.allowed("input", "u") and not law.allowed("input", "u", by_default=False)
+    with pytest.raises(StageError) as e:
+        Law(**good | change)
+    assert str(e.value) == f"law {change.get('name', 'shifted')!r}: {said}"
+
+
+def test_why_numba_cannot_is_said_in_a_line() -> None:
+    assert cannot(ValueError("Failed in nopython mode\n\n  first reason  \nsecond")) == "first reason"
+    assert cannot(ValueError("x" * 200)) == "x" * 100 and cannot(ValueError("")) == "ValueError"
+    assert cannot(ValueError("IMPORT_NAME")) == "an import inside a function; it belongs at the top of the file"

@@ -25,7 +25,8 @@ FIRMWARE = ("firmware", "modes", "monitors", "records", "schedule", "servo", "st
 # The rooms of the identification, and the headings of its thresholds that their tests hold.
 HEADINGS = {
     "vaneloop.identification": ("Least squares", "Noise", "Candidates", "Selection", "Regimes"),
-    "vaneloop.identification.user_models": ("Unmodelled terms", "User models"),
+    "vaneloop.identification.user_models": ("User models",),
+    "vaneloop.identification.unmodelled": ("Unmodelled terms",),
     "vaneloop.identification.vane_chain": ("Vane chain",),
 }
 SEARCH = tuple(
