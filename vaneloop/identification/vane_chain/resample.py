@@ -288,7 +288,7 @@ def no_gap_in_window(t: Array, fresh: Array) -> Array:
 def lately(rows: Array, seconds: float, dt: float = RASTER) -> Array:
     """Whether any of these rows, ``dt`` (s) apart, was less than some seconds ago."""
     n = np.arange(len(rows))
-    return np.asarray(n - np.maximum.accumulate(np.where(rows, n, -len(rows))) < seconds / dt)
+    return np.asarray(n - np.maximum.accumulate(np.where(rows, n, -np.inf)) < seconds / dt)
 
 
 def regimes_of(t: Array, columns: dict[str, Array]) -> tuple[dict[str, Array], dict[str, str]]:
