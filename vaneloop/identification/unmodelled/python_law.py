@@ -111,8 +111,8 @@ def python_law(law: LearnedLaw, system: System | None = None) -> str:
     along = period > 0.0 and law.channel != TIME  # what the file is given is the whole way, not that within a period
     within = f"q % {period!r}" if along else f"min(max(q, {low!r}), {high!r})"
     of = f"{law.channel}, of which each {period:.6g} {law.of_unit.strip('-')} are alike" if along else law.of
-    places = np.linspace(low, high, LAW_TEST_VALUES, endpoint=not along)
-    held = [(float(q), float(curve["curve"](q))) for q in places]  # type: ignore[operator]
+    places = np.linspace(low, high, LAW_TEST_VALUES, endpoint=not along).tolist()
+    held = [(q, float(curve["curve"](q))) for q in places]  # type: ignore[operator]
     goes = f", and goes on to [{low:.6g}, {high:.6g}]" if law.spoken else ""
     return FILE.format(
         sentence=f"{sentence[0].upper()}{sentence[1:]}.", equation=equation, of=of, of_unit=law.of_unit or "-",

@@ -55,8 +55,8 @@ def python_surface(law: LearnedSurface) -> str:
     code, constants, equation = _code(law, low, high)
     space: dict[str, object] = {}
     exec(f"import math\n{constants}\ndef surface(q1, q2):\n    {code}", space)  # our own text
-    places = [np.linspace(a, b, SURFACE_TEST_VALUES) for a, b in zip(low, high, strict=True)]
-    held = [(float(p), float(q), float(space["surface"](p, q))) for p in places[0] for q in places[1]]  # type: ignore[operator]
+    places = [np.linspace(a, b, SURFACE_TEST_VALUES).tolist() for a, b in zip(low, high, strict=True)]
+    held = [(p, q, float(space["surface"](p, q))) for p in places[0] for q in places[1]]  # type: ignore[operator]
     sentence = law.sentence().rstrip(".")
     return FILE.format(
         sentence=f"{sentence[0].upper()}{sentence[1:]}.", equation=equation, of=law.of, of_unit=law.of_unit or "-",
