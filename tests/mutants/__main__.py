@@ -151,9 +151,9 @@ NEAREST = {
     **dict.fromkeys(
         OWN_MODELS,
         "user_models_spec unmodelled_spec experiment_own laws own_laws hidden_law learn learn_beside learn_confirmed "
-        "learn_creep learn_differences learn_faint learn_followers learn_lags learn_periods learn_screening learn_slopes "
-        "learn_speed learn_stops learn_surfaces learn_turns learn_two learn_vanes promise spikes starts your_own_model "
-        "kept held",
+        "learn_creep learn_differences learn_faint learn_followers learn_lags learn_periods learn_screening "
+        "learn_slopes learn_speed learn_stops learn_surfaces learn_turns learn_two learn_vanes promise spikes "
+        "starts your_own_model kept held",
     ),
     "vaneloop.identification.vane_chain": (
         "vane_chain_spec recorders late_channels same_answer learn_vanes learn_lags learn_stops learn_followers "
