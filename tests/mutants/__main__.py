@@ -124,7 +124,7 @@ NEAREST = {
         "logs logs_frames_spec logs_names_spec logs_record_spec logs_tables_spec loggers reading readings guess held "
         "record logs_fuzz"
     ),
-    "hil.native": "native c_reference xcp",
+    "hil.native": "native_spec native c_reference xcp",
     "hil.loop": (
         "loop_spec loop lanes lockstep node secoc realtime moments replay native machines frames strategies "
         "scenarios_in_lanes gpu"
@@ -170,8 +170,8 @@ NEAREST = {
         "search_commands trust latest"
     ),
     "vaneloop.cli": (
-        "help exit_codes completion verbs search_commands campaign fuzz inject record design fleet_report fmu "
-        "guess schedule strategies spatial never_worse native xcp uds reading electromechanical"
+        "cli_spec experiment_own help exit_codes completion verbs search_commands campaign fuzz inject record design "
+        "fleet_report fmu guess schedule strategies spatial never_worse native xcp uds reading electromechanical"
     ),
     "vaneloop.web": "web moments",
 }
