@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
 import signal
 import subprocess
@@ -287,3 +288,18 @@ def test_a_target_that_is_not_there_is_refused(options: list[str]) -> None:
         [sys.executable, "-m", "tests.mutants", *options], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert run.returncode == 2 and "Traceback" not in run.stderr
+
+
+def test_a_line_that_a_fork_runs_is_noted() -> None:
+    hits: set[tuple[str, int]] = {("a.py", 1)}
+    note = trial._HitsOfForks(hits)
+    note(("a.py", 2))
+    assert note.told() == set()
+    for line in (3, 4):
+        if os.fork() == 0:
+            note(("a.py", 1))
+            note(("b.py", line))
+            os._exit(0)
+        os.wait()
+        assert note.told() == {("b.py", line)}
+    assert hits == {("a.py", 1), ("a.py", 2)}

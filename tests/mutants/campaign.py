@@ -281,8 +281,9 @@ class _Campaign:
         """Of each test: why it does not count, its processor time, and the lines that it runs: the place of a file, and
         a number.
         """
+        forks = _HitsOfForks(self.hits)
         for file, module in modules.items():
-            vars(module)["__hit__"] = self.hits.add
+            vars(module)["__hit__"] = forks
             for name, code in with_hits(ROOT, file, compiled=self.target.compiled):
                 with contextlib.suppress(LookupError, AttributeError, TypeError, ValueError):
                     _function(module, name).__code__ = code
@@ -293,7 +294,7 @@ class _Campaign:
             made, begin = set(self.shared), _processor_time()
             bad = _within(item, following)
             seconds = _processor_time() - begin - sum(s for f, (s, _) in self.shared.items() if f not in made)
-            reached = set(self.hits)
+            reached = self.hits | forks.told()
             for cost, lines in self._shared_by(item):
                 seconds += cost
                 reached |= lines
@@ -365,6 +366,28 @@ class _Campaign:
                 else:
                     for m, by in killed[item.nodeid]:
                         decided(m, by)
+
+
+class _HitsOfForks:
+    """Notes a line that is run, also in a process that is forked off a test: that has the changed code, too."""
+
+    def __init__(self, hits: Lines):
+        self.hits, self.owner = hits, os.getpid()
+        self.file = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  # as long as this process
+        self.read = 0
+
+    def __call__(self, line: tuple[str, int]) -> None:
+        if line not in self.hits:
+            self.hits.add(line)
+            if os.getpid() != self.owner:
+                with contextlib.suppress(OSError):  # it may have closed what is not its own
+                    self.file.write(f"{line[0]} {line[1]}\n".encode())
+
+    def told(self) -> Lines:
+        """Lines that forks have run since the last time."""
+        data = os.pread(self.file.fileno(), os.fstat(self.file.fileno()).st_size - self.read, self.read)
+        self.read += len(data)
+        return {(file, int(n)) for file, n in (line.split() for line in data.decode().splitlines())}
 
 
 def _words_of(item: pytest.Item) -> frozenset[str]:
