@@ -18,7 +18,9 @@ from vaneloop.identification import Effect, Parameter, Stage
 from vaneloop.identification.candidates.closed_forms import Formula
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import diagnose_stage
+from vaneloop.identification.settings import LEVEL_SPREAD
 from vaneloop.identification.subsystem import Array
+from vaneloop.identification.unmodelled.closed_form_fits import goes_on
 from vaneloop.identification.unmodelled.confirmation import stands_before
 from vaneloop.identification.unmodelled.curve_candidates import (
     Candidate,
@@ -28,6 +30,7 @@ from vaneloop.identification.unmodelled.curve_candidates import (
     candidates,
     shape_fits,
 )
+from vaneloop.identification.unmodelled.fitted_candidate import adds_what, channel_of, plain, strange
 from vaneloop.identification.unmodelled.learned_law import LearnedLaw, law_of
 from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
 from vaneloop.identification.unmodelled.learning import CurveSearch
@@ -51,6 +54,7 @@ from vaneloop.identification.unmodelled.spectral_lines import (
     about,
     periods_along,
 )
+from vaneloop.identification.unmodelled.surface_candidates import may_be_of, surface_of
 from vaneloop.identification.unmodelled.surface_closed_forms import Product
 from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.by_log import bind
@@ -500,3 +504,90 @@ def test_a_law_file_is_written_for_what_a_law_can_be_of() -> None:
             InputError, match=rf"^--python: {bad.name} is a function of w at {bad.at}; a Law of your own"
         ):
             python_law(bad, shaft)
+
+
+# ---- which is plainer, how far it goes, a surface --------------------------------------------------------------------
+
+
+def named(name: str, at: str = "y", how: str = "output adds", **more: Any) -> Candidate:
+    return replace(
+        curve_of(Quantity("u", "V", INPUT, U)), quantity=Quantity(name, "V", INPUT, U, **more), at=at, how=how
+    )
+
+
+def test_what_is_at_a_place_is_plainer_than_what_follows_and_memory_imitates_most() -> None:
+    order = [
+        named("y", "y_sensor"), named("u"), named("u_minus_w", less=(INPUT + 1, "w")), named("time"),
+        named("direction_of_u"), named("stops_of_u"),
+    ]  # fmt: skip
+    assert [strange(c) for c in order] == [0, 1, 2, 3, 4, 5]
+    assert strange(named("u_every_0p5", span=3.0)) == 4 and strange(named("u_lagged_by_5_s")) == 5
+    assert strange(named("time_since_reversal_of_u")) == strange(named("distance_since_reversal_of_u")) == 4
+    assert strange(replace(named("u"), near=True)) == 0
+    assert plain(named("u")) < plain(named("u", how="output times")) < plain(named("time"))
+    assert adds_what(named("u"), named("u", how="output times")) and not adds_what(named("u"), named("u"))
+    assert not adds_what(named("u"), named("w", how="output times"))
+    assert channel_of(named("u_lagged_by_5_s")) == "u" and channel_of(named("u")) == "u"
+
+
+def test_a_formula_goes_on_while_it_is_not_ten_times_as_steep() -> None:
+    c = curve_of(Quantity("u", "V", INPUT, np.linspace(-1.0, 1.0, 400)))
+    ground: Any = SimpleNamespace(reach=lambda c: (-3.0, 3.0))
+    by = {f.name: f for f in FORMS}
+    assert goes_on(ground, c, by["line"], np.array([2.0])) == (-3.0, 3.0)
+    assert goes_on(ground, c, by["square"], np.array([2.0])) == (-3.0, 3.0)
+    low, high = goes_on(ground, c, by["exponential"], np.array([1.0, 2.0]))  # exp(2 q) is ten times as steep at 2.15
+    assert low == -3.0 and high == pytest.approx(1.0 + 0.5 * np.log(10.0), abs=0.03)
+
+
+@pytest.mark.parametrize("additive", [False, True])
+def test_a_surface_has_the_products_of_its_functions(additive: bool) -> None:
+    rng = np.random.default_rng(2)
+    x, z = rng.uniform(-1.0, 1.0, 600), rng.uniform(2.0, 4.0, 600)
+    one, two = (curve_of(Quantity(n, "V", INPUT + k, v)) for k, (n, v) in enumerate((("u", x), ("w", z))))
+    s = surface_of(one, two)
+    assert s is not None and s.name == "y.curve_of_u_and_w"
+    s = replace(s, additive=additive)
+    n = len(s.basis.bend)
+    assert len(s.pairs) == (2 * n - 1 if additive else n * n) and s.pairs[0] == (0, 0)
+    assert replace(s, mean=False).pairs[0] == (0, 1)
+    effect = s.effect(2.0)
+    for (i, j), p in zip(s.pairs, effect.parameters, strict=True):
+        bend = s.basis.bend[i] + s.across.bend[j]
+        of = 2.0 / np.sqrt(bend) if bend > 0.0 else LEVEL_SPREAD
+        assert (p.name, p.scale) == (f"w_{i}_{j}", 0.5) and p.tolerance == pytest.approx(np.sqrt(3.0) * 0.5 * of)
+    amplitudes = rng.standard_normal(len(s.pairs))
+    curve = s.placed().curve
+    assert curve is not None
+    a, b = (basis.design(v) @ basis.turn for basis, v in ((s.basis, x), (s.across, z)))
+    wanted = sum(v * a[:, i] * b[:, j] for v, (i, j) in zip(amplitudes, s.pairs, strict=True))
+    inside = s.reaches(x, z)
+    got = curve.at(np.stack([x, z]), curve.table(amplitudes))
+    off = np.abs(got - wanted)[inside]
+    assert inside.mean() > 0.9 and np.quantile(off, 0.9) < 0.02 * np.ptp(wanted)
+    assert surface_of(one, replace(two, quantity=Quantity("w", "V", INPUT + 1, 2.0 * x))) is None  # along a line only
+    assert [may_be_of(q.quantity) for q in (one, named("time"), named("stops_of_u"), named("direction_of_u"))] == [
+        True, False, False, False,
+    ]  # fmt: skip
+
+
+def test_where_a_law_holds_is_said() -> None:
+    curve = made("output adds", "y", "u")
+    been = "y.curve_of_u: u has been in [-2, 2] V; the law file has the curve"
+    assert curve.range_note() == f"{been}; beyond, it stays as at its end"
+    formula = Formula("line", "2 u", {"a": 2.0}, 1.0, 2)
+    spoken = replace(curve, spoken=formula, reach=(-4.0, 4.0))
+    assert spoken.range_note() == (
+        "y.curve_of_u: u has been in [-2, 2] V; the law file has the formula, which does as well as the curve; it goes "
+        "on to [-4, 4] V, and stays as there beyond"
+    )
+    always = replace(curve, spoken=Formula("constant", "3", {"a": 3.0}, 1.0, 1))
+    assert always.constant and always.range_note().endswith("has the formula, which does as well as the curve")
+    assert replace(curve, period=0.5).range_note() == "y.curve_of_u: the law file has the curve"
+    for how, said in (
+        ("output adds", "a function of u is added to the reading y"), ("state adds", "taken off the derivative of y"),
+        ("input times", "y is multiplied by 1 + "), ("output times", "the reading y is multiplied by 1 + "),
+    ):  # fmt: skip
+        assert said.removeprefix("a function of u ") in replace(curve, how=how).sentence()
+    assert "near 2 u" in replace(curve, formulas=[formula]).sentence() and "near" not in spoken.sentence()
+    assert curve.of_the_kind_of(replace(curve, x=curve.y)) and not curve.of_the_kind_of(replace(curve, at="z"))
