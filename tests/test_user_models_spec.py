@@ -983,3 +983,81 @@ def test_why_numba_cannot_is_said_in_a_line() -> None:
     assert cannot(ValueError("Failed in nopython mode\n\n  first reason  \nsecond")) == "first reason"
     assert cannot(ValueError("x" * 200)) == "x" * 100 and cannot(ValueError("")) == "ValueError"
     assert cannot(ValueError("IMPORT_NAME")) == "an import inside a function; it belongs at the top of the file"
+
+
+# ---- forces ----------------------------------------------------------------------------------------------------------
+
+
+def damper(**more: Any) -> tuple[BoundSystem, Array, Array]:
+    """A damper whose force, motion and speed are measured; with its displacement and speed."""
+    t = 0.01 * np.arange(400)
+    x, v = 0.5 * np.sin(2.0 * t), np.cos(2.0 * t)
+    system = System(
+        "damper", "force", lambda u, p: p.c * u.velocity, {"f": "N"}, velocity="v", position="x",
+        units={"position": "mm"}, parameters=[Parameter("c", 3.0, "N s/m")], **more,
+    )  # fmt: skip
+    return BoundSystem(system, [record(t, x=x, v=v, f=3.0 * v)]), x, v
+
+
+def pulling(v: Any, x: Any, t: Any, p: Any) -> Any:
+    return NUMBERS["one"] * p.pull * v * x
+
+
+def test_laws_of_force_add_what_their_equations_say() -> None:
+    own = Law("pulling", "force", pulling, [Parameter("pull", 0.0, "1", -9.0, 9.0)], [1.0, -1.0])
+    bound, x, v = damper(laws=[own])
+    assert bound.data.cutoff is None and not any("forces compared" in n for n in bound.notes)
+    names = {e.name for e in bound.stage.effects}
+    assert {"force.viscous", "force.coulomb", "force.elastic_plastic", "f.gain", "f.lag"} <= names
+    assert not names & {"f.bias", "f.cubic"} and "f.bias" in {e.name for e in damper(places=["f"])[0].stage.effects}
+    neutral, index = bound.stage.neutral(), bound.stage.index()
+
+    def with_law(law: str, *numbers: float) -> Array:
+        theta = neutral.copy()
+        theta[index[law]] = numbers
+        return np.asarray(bound.run(theta[None])[0, 0] - 3.0 * v)
+
+    assert with_law("force.viscous", 0.7) == pytest.approx(0.7 * v)
+    assert with_law("force.force_offset", 0.7) == pytest.approx(np.full(400, 0.7))
+    assert with_law("force.spring", 0.4) == pytest.approx(0.4 * x)
+    assert with_law("force.pulling", 1.5) == pytest.approx(1.5 * v * x)
+    coulomb = with_law("force.coulomb", 0.6)
+    assert coulomb[np.abs(v) > 0.05] == pytest.approx(0.6 * np.sign(v)[np.abs(v) > 0.05], rel=1e-3)
+    both = neutral.copy()
+    both[index["force.viscous"]], both[index["force.spring"]] = 0.7, 0.4
+    assert bound.run(both[None])[0, 0] == pytest.approx(3.7 * v + 0.4 * x)
+    regimes, units = bound.data.regimes()
+    assert units["velocity"] == "mm/s" and units["position"] == "mm" and "acceleration" not in regimes
+    assert set(np.unique(regimes["direction"])) == {-1.0, 1.0} | ({0.0} if (np.abs(v) < 0.01 * rms(v)).any() else set())
+
+
+def test_a_force_that_goes_the_wrong_way_for_its_law_is_said() -> None:
+    bound, x, v = damper(without=[])
+    judge = LeastSquaresProblem(bound.thinned, bound.floor)
+    d = as_given(Logs(bound, None), judge.fit((), bound.stage.neutral()))
+    fit = judge.fit(("force.spring",), bound.stage.neutral())
+    fit.theta[bound.stage.index()["force.spring"]] = -0.25
+    d.final = fit
+    (said,) = [s for s in parameter_warnings(bound, judge, d) if s.startswith("force.spring is negative")]
+    assert said.startswith(
+        "force.spring is negative (-0.25 (N)/(mm)): it pushes away from the middle instead of back to it; "
+    )
+
+
+def test_forces_are_compared_up_to_a_frequency_and_not_at_the_ends() -> None:
+    t = 0.005 * np.arange(1600)
+    x = np.sin(3.0 * t) + 0.2 * np.sin(11.0 * t)
+    a = -9.0 * np.sin(3.0 * t) - 24.2 * np.sin(11.0 * t)
+    d = Data(mover(), [record(t, x=x, f=2.0 * a + 0.01 * white(1, 1600))])
+    assert d.cutoff is not None and 1.5 < d.cutoff < 4.0 and d.motion_cutoff == pytest.approx(3.0 * d.cutoff)
+    assert d.notes[-1] == f"forces compared up to {d.cutoff:.3g} Hz (cutoff= sets another)"
+    edge = 2.0 / d.cutoff + 8 * 0.005
+    lost = np.isnan(d.measured[0])
+    assert lost.tolist() == ((t < edge) | (t > t[-1] - edge)).tolist()
+    inside = ~lost
+    assert d.u[0][2][inside] == pytest.approx(a[inside], abs=0.3)
+    again = Data(mover(), [record(t, x=x, f=2.0 * a)], like=d)
+    assert again.cutoff == d.cutoff and again.notes == []
+    own = Data(mover(cutoff=3.0), [record(t, x=x, f=2.0 * a)])
+    assert own.cutoff == 3.0 and own.notes == []
+    assert d.noise() == pytest.approx([0.01 * np.sqrt(2.0 * d.cutoff * 0.005)], rel=0.4)
