@@ -16,12 +16,17 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 import pytest
 
+from controller import STRATEGIES
 from hil.calibrate.station import MASTER
+from hil.replay import STATISTICS
 from hil.uds.server import FUNCTIONAL, REQUEST
+from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.cli import attended, campaign, completion, ecu, fleet, fuzz, inject, main, options, replay, station
 from vaneloop.cli import engine_test as engine
 from vaneloop.cli import strategies as of_strategies
+from vaneloop.design.strategies import FIGURES
+from vaneloop.pages.engine_test import PAPER_TABLE_5
 
 Said = pytest.CaptureFixture[str]
 
@@ -181,13 +186,13 @@ def test_what_the_reading_options_say() -> None:
 def test_code_of_others_runs_only_where_somebody_says_so(monkeypatch: pytest.MonkeyPatch, capsys: Said) -> None:
     options.trusted(args(trust=False), "run", [])
     options.trusted(args(trust=True), "run", ["evil.py"])
-    monkeypatch.setattr(options.terminal, "is_terminal", lambda stream: False)
+    monkeypatch.setattr(terminal, "is_terminal", lambda stream: False)
     text = "run: names code that would run here with your rights: a.py, b.so"
     assert refused(options.trusted, args(trust=False), "run", ["a.py", "b.so"]) == f"{text}; --trust says that it may"
-    monkeypatch.setattr(options.terminal, "is_terminal", lambda stream: True)
-    monkeypatch.setattr(options.terminal, "input_of", lambda stream: 0)
+    monkeypatch.setattr(terminal, "is_terminal", lambda stream: True)
+    monkeypatch.setattr(terminal, "input_of", lambda stream: 0)
     for answer, runs in (("y\n", True), ("YES \n", True), ("n\n", False), ("\n", False)):
-        monkeypatch.setattr(options.sys, "stdin", SimpleNamespace(readline=lambda answer=answer: answer))
+        monkeypatch.setattr("sys.stdin", SimpleNamespace(readline=lambda answer=answer: answer))
         if runs:
             options.trusted(args(trust=False), "run", ["a.py"])
         else:
@@ -261,14 +266,14 @@ def test_a_line_on_the_standard_error_replaces_the_one_before(monkeypatch: pytes
         (True, False, "\rlonger\rab    \r      \r".replace("\r      \r", "\r" + " " * 2 + "\r")),
         (False, True, "longer\nab\n"), (False, False, ""),
     ):  # fmt: skip
-        monkeypatch.setattr(station.terminal, "is_terminal", lambda stream, is_terminal=is_terminal: is_terminal)
+        monkeypatch.setattr(terminal, "is_terminal", lambda stream, is_terminal=is_terminal: is_terminal)
         line = station.Live(args(live=live))
         line.say("longer")
         line.say("ab")
         line.close()
         line.say("nothing")
         assert capfd.readouterr().err == wanted
-    monkeypatch.setattr(station.terminal, "is_terminal", lambda stream: True)
+    monkeypatch.setattr(terminal, "is_terminal", lambda stream: True)
     assert not station.Live(args(live=True, quiet=True)).on
 
 
@@ -314,8 +319,8 @@ def test_lines_are_typed_until_there_are_none_or_one_never_ends(typed: bytes, to
 )  # fmt: skip
 def test_keys_are_what_they_say(keys: list[bytes], told: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     left = [*keys, b""]
-    monkeypatch.setattr(ecu.select, "select", lambda *_: ([1], [], []))
-    monkeypatch.setattr(ecu.os, "read", lambda fd, most: left.pop(0))
+    monkeypatch.setattr("select.select", lambda *_: ([1], [], []))
+    monkeypatch.setattr("vaneloop.cli.ecu.os", SimpleNamespace(read=lambda fd, most: left.pop(0)))
     got: list[str] = []
     ecu._keys(0, SimpleNamespace(line=got.append, quit=False))
     assert got == told and left == []
@@ -432,7 +437,7 @@ def test_a_fuzzed_tool_is_told(failure: str, tmp_path: Path, monkeypatch: pytest
         return c
 
     wrote: list[Any] = []
-    monkeypatch.setattr(fuzz.fuzz_tools, "fuzz_tools", campaign_of)
+    monkeypatch.setattr("vaneloop.cli.fuzz.fuzz_tools.fuzz_tools", campaign_of)
     monkeypatch.setattr(fuzz, "write_frames", lambda *given: wrote.append(given))
     given = args(
         tool="xcp", frames=100, seed=7, current_limit=30.0, stroke_limit=None, recovery=1.5, out="f.blf",
@@ -454,10 +459,8 @@ def test_a_fuzzed_tool_is_told(failure: str, tmp_path: Path, monkeypatch: pytest
 def test_the_engine_test_is_held_against_the_paper(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Said
 ) -> None:
-    paper = engine.PAPER_TABLE_5
-
     def result(by: float) -> Any:
-        figures = {k: paper.get(k, 0.1) * by for k in engine.STATISTICS}
+        figures = {k: PAPER_TABLE_5.get(k, 0.1) * by for k in STATISTICS}
         return SimpleNamespace(
             signals=[SimpleNamespace(signal="vigv", samples=9, **figures)], simulated_s=3164.0, wall_s=2.0
         )
@@ -468,7 +471,7 @@ def test_the_engine_test_is_held_against_the_paper(
         monkeypatch.setattr(engine, "replay_json", lambda r: {"simulated_s": r.simulated_s})
         assert main.main(["engine-test", "--json", str(tmp_path / "e.json")]) == code
         said = lines(capsys)
-        assert sum(s.startswith("exceeded: dual vigv ") for s in said) == (len(engine.STATISTICS) - 1) * code
+        assert sum(s.startswith("exceeded: dual vigv ") for s in said) == (len(STATISTICS) - 1) * code
         assert any(s.startswith("paper, dual: vigv - ") for s in said) and any(
             s.startswith("single: vigv") for s in said
         )
@@ -504,9 +507,9 @@ def test_a_fleet_s_folder_and_patience(monkeypatch: pytest.MonkeyPatch, capsys: 
 
 
 def test_strategies_are_judged_by_their_goals(capsys: Said) -> None:
-    figures = {"vigv": dict.fromkeys(of_strategies.FIGURES, 0.5)}
+    figures = {"vigv": dict.fromkeys(FIGURES, 0.5)}
     o: Any = SimpleNamespace(figures=figures, travel=1234.0, reversals=7, current=3.0)
-    outcomes = {("worn", s): o for s in of_strategies.STRATEGIES}
+    outcomes = {("worn", s): o for s in STRATEGIES}
     failure: Any = SimpleNamespace(
         during="at rest",
         at=99.0,
@@ -526,8 +529,8 @@ def test_strategies_are_judged_by_their_goals(capsys: Said) -> None:
     assert (
         said[0].startswith("10 s under each strategy") and said[-1] == "goals met: 1 of 2; better: 2.0 (at least 1.5)"
     )
-    assert any(s.startswith(f"worn {of_strategies.STRATEGIES[0]} 0.500") for s in said)
-    assert not any(s.startswith(f"worn {of_strategies.STRATEGIES[1]}") for s in said)
+    assert any(s.startswith(f"worn {STRATEGIES[0]} 0.500") for s in said)
+    assert not any(s.startswith(f"worn {STRATEGIES[1]}") for s in said)
     assert sum(s.startswith("at rest stuck") for s in said) == 1 and sum(s.startswith("stuck") for s in said) == 1
 
 

@@ -279,7 +279,7 @@ def test_what_a_controller_did_is_one_line() -> None:
 
 
 def test_how_a_process_ended_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(isolation.black_box, "left", lambda folder: None)
+    monkeypatch.setattr(black_box, "left", lambda folder: None)
     lost = "; memory that the controller overwrote may be the cause"
     for end, said in (
         (_End(5, signal.SIGSEGV), f"ended by SIGSEGV, outside a call of it{lost}"),
@@ -289,17 +289,22 @@ def test_how_a_process_ended_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         (_End(), "ended what watches it, or took away its folder for temporary files"),
     ):
         assert isolation._failure(tmp_path, end, None) == f"the process with the controller {said}"
-    monkeypatch.setattr(isolation.black_box, "left", lambda folder: box_of(inputs=np.zeros((0, len(INPUTS)))))
+    monkeypatch.setattr(black_box, "left", lambda folder: box_of(inputs=np.zeros((0, len(INPUTS)))))
     own = "ended by SIGSEGV (it reached memory that is not its own)"
     assert isolation._failure(tmp_path, _End(5, signal.SIGSEGV), None) == (
         f"--controller c.so: {own}, in tick 7, 0.007 s after power-on"
     )
     assert "not its own" not in isolation._failure(tmp_path, _End(5, signal.SIGSEGV, "was stopped for 5 s"), None)
     wrote: list[Any] = []
-    monkeypatch.setattr(isolation.crash_log, "write", lambda *given: wrote.append(given) or "crash log: f")
+
+    def write(*given: Any) -> str:
+        wrote.append(given)
+        return "crash log: f"
+
+    monkeypatch.setattr(crash_log, "write", write)
     assert isolation._failure(tmp_path, _End(5, signal.SIGSEGV), "f").endswith("after power-on; crash log: f")
     assert len(wrote) == 1
-    monkeypatch.setattr(isolation.black_box, "left", lambda folder: box_of(tick=-1))
+    monkeypatch.setattr(black_box, "left", lambda folder: box_of(tick=-1))
     assert not isolation._failure(tmp_path, _End(5, signal.SIGSEGV), "f").endswith("crash log: f") and len(wrote) == 1
     assert isolation._name(signal.SIGRTMIN + 1) == f"signal {signal.SIGRTMIN + 1}"
 

@@ -74,7 +74,7 @@ def guard() -> Guard:
     return Guard(echo, TOKEN, 8080, 1000, loopback=True, pages=["/", "/run"])
 
 
-KNOWN = {"cookie": f"other=1; vaneloop_token_8080={TOKEN}"}
+KNOWN: dict[str, Any] = {"cookie": f"other=1; vaneloop_token_8080={TOKEN}"}
 
 
 def test_who_knows_the_token_may_ask_and_nobody_else(guard: Guard) -> None:
