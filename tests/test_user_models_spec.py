@@ -225,6 +225,7 @@ def test_rows_in_no_order_have_the_noise_of_planes_through_their_neighbours() ->
     rng = np.random.default_rng(1)
     u = rng.uniform(-1.0, 1.0, (2, 1500)) * [[3.0], [500.0]]
     y = np.sin(0.5 * u[0]) + 1e-3 * u[1] + 0.05 * white(2, 1500)
+    assert not any(without_order(np.sort(size * row[None])) for row in u for size in (1e-3, 1.0, 1e3))
     assert without_order(u) and not without_order(np.sort(u)) and not without_order(np.vstack([u, np.sort(u[:1])]))
     assert without_order(np.vstack([u, np.ones((1, 1500))])) and not without_order(np.ones((2, 1500)))
     assert noise_of_neighbours(u, y) == pytest.approx(0.05, rel=0.12)
