@@ -57,6 +57,8 @@ def joined(t: np.ndarray, values: np.ndarray, fewest: int = 0) -> Joined | None:
         return None
     even = (row[2:] - row[:-2] == 2) & (row[1:-1] - row[:-2] == 1)
     at = row[1:-1][even & bends]
+    if np.count_nonzero(np.diff(at) == 1) > 2.0 * STRAY * at.size:  # two corners side by side: one of them strays
+        return None
     for every in range(SLOWEST, 1, -1):
         if every ** -float(at.size) > CHANCE:
             continue
@@ -88,21 +90,36 @@ def _bends(values: np.ndarray) -> np.ndarray:
     if SLOWEST ** -float(np.count_nonzero(some)) > CHANCE:  # too few to tell anything
         return some
     digit = _last_digit(values)
-    return np.asarray(bend > 2.01 * np.maximum(np.maximum(digit[2:], digit[1:-1]), digit[:-2]))
+    if digit.size > 1:
+        digit = np.maximum(np.maximum(digit[2:], digit[1:-1]), digit[:-2])
+    return np.asarray(bend > 2.01 * digit)
 
 
 def _last_digit(values: np.ndarray) -> np.ndarray:
     """For each value the decimal step of which it and those of its size are multiples, as text has them; 1e-9 of the
-    largest where there is none.
+    largest where there is none. One step where all are of one size.
     """
-    size = np.floor(np.log10(np.maximum(np.abs(values), 1e-12)))
-    out = np.full(values.size, _LEAST * np.abs(values).max(initial=0.0))
-    for s in np.unique(size):
-        of = size == s
-        some = values[of]
-        some = some[:: max(1, some.size // DIGITS_OF)]
-        steps = some[None] * _TENS
-        fits = np.count_nonzero(np.abs(steps - np.rint(steps)) < _NEAR, axis=1) > 0.98 * some.size
-        if fits.any():
-            out[of] = np.maximum(out[of], 1.0 / _TENS[int(np.argmax(fits)), 0])
+    far = np.abs(values)
+    least = _LEAST * far.max(initial=0.0)
+    low, high = _size(far.min(initial=np.inf)), _size(far.max(initial=0.0))
+    if low == high:
+        return np.array([_step_of(values, least)])
+    size = _size(far)
+    out = np.empty(values.size)
+    for s in np.flatnonzero(np.bincount((size - low).astype(np.int64))):
+        of = size == low + s
+        out[of] = _step_of(values[of], least)
     return out
+
+
+def _size(far: np.ndarray) -> np.ndarray:
+    """Tens of a number before its first digit; -12 of what is smaller."""
+    return np.floor(np.log10(np.maximum(far, 1e-12)))
+
+
+def _step_of(values: np.ndarray, least: float) -> float:
+    """The decimal step of which values of one size are multiples, at least ``least``."""
+    some = values[:: max(1, values.size // DIGITS_OF)]
+    steps = some * _TENS
+    fits = np.count_nonzero(np.abs(steps - np.rint(steps)) < _NEAR, axis=1) > 0.98 * some.size
+    return max(least, 1.0 / _TENS[int(np.argmax(fits)), 0]) if fits.any() else least

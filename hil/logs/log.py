@@ -218,20 +218,30 @@ def _in_time(s: Series, t: np.ndarray, known: dict[int, np.ndarray], notes: list
             said = f"time: {what} have a wrong time stamp ({where}): left out"
             notes.append(Note(said, "left out", "time", known[id(s.t)].size, known[id(s.t)][:MOST_ROWS] + s.first))
     bad = known[id(s.t)]
+    if not bad.size:
+        return t
     there = np.isfinite(s.values)
-    if not bad.size or 2 * np.count_nonzero(there[bad]) > np.count_nonzero(
-        there
-    ):  # a channel that has a block of rows of its own
+    if 2 * np.count_nonzero(there[bad]) > np.count_nonzero(there):  # a channel that has a block of rows of its own
         return t
     t = t.copy()
     t[bad] = ABSENT
     return t
 
 
-def _clean(path: Path, signal: str, key: str, s: Series, in_order: bool, notes: list[str]) -> Channel | None:
-    """Samples that can be used: both numbers finite, time strictly increasing; None where nothing is left."""
+def _rises(t: np.ndarray) -> bool:
+    """Whether all times are finite and strictly increasing."""
+    return bool(np.isfinite(t).all() and (t[1:] > t[:-1]).all())
+
+
+def _clean(
+    path: Path, signal: str, key: str, s: Series, in_order: bool, rises: bool, notes: list[str]
+) -> Channel | None:
+    """Samples that can be used: both numbers finite, time strictly increasing; None where nothing is left.
+
+    rises  the times are known to be finite and strictly increasing
+    """
     t, values = s.t, s.values
-    finite = np.isfinite(t) & np.isfinite(values)
+    finite = np.isfinite(values) if rises else np.isfinite(t) & np.isfinite(values)
     if not finite.all():
         lost = int(np.count_nonzero(~finite & ~(is_absent(values) | is_absent(t))))
         if lost:
@@ -239,14 +249,14 @@ def _clean(path: Path, signal: str, key: str, s: Series, in_order: bool, notes: 
             said = f"{signal} ({key}): {lost} of {t.size} samples are NaN or infinite: left out"
             notes.append(Note(said, "left out", signal, lost, rows))
         t, values = t[finite], values[finite]
-    if not in_order and t.size:
+    if not in_order and not rises and t.size:
         back = np.flatnonzero(np.diff(t) < 0)
         if back.size:
             row, (a, b) = np.flatnonzero(finite)[back[0] + 1] + s.first, t[back[0] : back[0] + 2]
             raise LogError(
                 f"{path}: {signal} ({key}): time runs backwards at {s.word} {row}, from {a:.9g} s to {b:.9g} s"
             )
-    if t.size:
+    if t.size and not rises:
         last = np.append(np.diff(t) > 0, True)
         changed = np.count_nonzero(np.diff(values)[~last[:-1]])
         if 2 * changed > t.size:  # not a few samples: the clock does not tell them apart
@@ -361,8 +371,8 @@ def read_log(
     keys: dict[str, str] = {}
     wrong: list[tuple[str, str, str, np.ndarray]] = []
     known: dict[int, np.ndarray] = {}
-    # channels of a table share its time: that of the file, which lives as long as its id counts, and in s
-    times: dict[tuple[int, str], tuple[np.ndarray, np.ndarray]] = {}
+    # channels of a table share its time: that of the file, which lives as long as its id counts, in s, whether it rises
+    times: dict[tuple[int, str], tuple[np.ndarray, np.ndarray, bool]] = {}
     for signal in signals:
         name = named.get(signal, signal)
         said = len(source.notes), len(notes)
@@ -375,8 +385,9 @@ def read_log(
             key, s = taken
             with np.errstate(all="ignore"):  # what overflows is not finite and left out below
                 if (id(s.t), s.t_unit) not in times:
-                    times[id(s.t), s.t_unit] = s.t, _in_seconds(path, unit, s)
-                t = times[id(s.t), s.t_unit][1]
+                    seconds = _in_seconds(path, unit, s)
+                    times[id(s.t), s.t_unit] = s.t, seconds, _rises(seconds)
+                _, t, rises = times[id(s.t), s.t_unit]
                 try:
                     values = unit.convert(signal, key, s.values, s.unit)
                 except UnitError as e:
@@ -386,9 +397,9 @@ def read_log(
                     raise LogError(f"{path}: {signal} ({key}): {what}{found}")
             if values is not s.values:
                 values = np.where(is_absent(s.values), ABSENT, values)
-            if not source.sorted:
+            if not source.sorted and not rises:
                 t = _in_time(s, t, known, notes)
-            channel = _clean(path, signal, key, replace(s, t=t, values=values), source.sorted, notes)
+            channel = _clean(path, signal, key, replace(s, t=t, values=values), source.sorted, rises, notes)
             if channel is not None and is_ours(signal, signals):
                 channel = _inside(signal, key, channel, wrong, notes)
             if channel is not None:
@@ -489,7 +500,7 @@ def _fresh(channels: dict[str, Channel], notes: list[str]) -> dict[str, Channel]
     tables: list[list[str]] = []
     for name, c in channels.items():
         if not c.framed:
-            table = next((names for names in tables if np.array_equal(channels[names[0]].t, c.t)), None)
+            table = next((names for names in tables if _same(channels[names[0]].t, c.t)), None)
             if table is None:
                 tables.append([name])
             else:
@@ -507,6 +518,10 @@ def _fresh(channels: dict[str, Channel], notes: list[str]) -> dict[str, Channel]
             c = channels[n]
             out[n] = replace(c, t=c.t[~stale], values=c.values[~stale])
     return out
+
+
+def _same(a: np.ndarray, b: np.ndarray) -> bool:
+    return a is b or np.array_equal(a, b)
 
 
 def _own_samples(channels: dict[str, Channel], notes: list[str]) -> dict[str, Channel]:
