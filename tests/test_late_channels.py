@@ -136,6 +136,29 @@ def test_answers_count_what_was_done(verb: Any) -> None:
     assert all(f">{cell}</td>" in table for cell in ("left out", "x_lvdt", "3", "4, 5, 9", str(note)))
 
 
+READS_A_LOG = [
+    "compare", "locate", "diagnose", "extend --effect valve_dead_band --out m.toml", "experiment", "learn", "replay",
+    "map", "run --bus lockstep --log", "run --bus lockstep --profile", "schedule --log",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", READS_A_LOG)
+def test_every_command_that_reads_a_log_counts_in_json_what_it_did(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    log = a_log()[0:20]
+    names = ["n_dem", "n_r"] + ["x_lvdt", "i_cmd", "vigv"] * command.startswith(("extend", "schedule"))
+    write_log(tmp_path / "bad.csv", {n: log.channels[n] for n in names})
+    lines = (tmp_path / "bad.csv").read_text().splitlines()
+    lines[299] += ",1"
+    (tmp_path / "bad.csv").write_text("\n".join(lines))
+    main([*command.split(), str(tmp_path / "bad.csv"), "--json", str(tmp_path / "j"), "--quiet"])
+    said = json.loads((tmp_path / "j").read_text())
+    assert [(d["kind"], d["of"], d["count"], d["rows"]) for d in said["done"]] == [("left out", "rows", 1, [300])]
+    assert said["done"][0]["said"] in said["notes"]
+
+
 def test_an_excerpt_of_a_long_log_is_cut_likewise() -> None:
     log = between(a_log(), "i_cmd", 12.0, SECONDS)
     grid = grid_of(log)

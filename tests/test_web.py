@@ -26,6 +26,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from hil.logs.notes import counted
 from hil.logs.survey import survey
 from tests.browser import AXE, CHROMIUM, LONG, WHY_NOT, driver, look_at, shot, violations
 from tests.conftest import ROOT, examples
@@ -456,7 +457,13 @@ def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
     assert page.locator(".spark").count() >= 4
     page.get_by_text("--design-rpm 38000, if that is 100 %").first.wait_for()
     # what the log has beside them is named, with the reason, in the words of `vaneloop map`
-    assert page.locator(".unused li").all_inner_texts() == survey(server.folder / "renamed.csv").unused() != []
+    seen = survey(server.folder / "renamed.csv")
+    assert page.locator(".unused li").all_inner_texts() == seen.unused() != []
+    page.get_by_text("What reading did to the log").click()  # as data: the table of the command's page
+    table = page.locator(".vtable", has_text="in words")
+    assert table.locator("tr").count() == 1 + len(counted(seen.notes)) > 1
+    assert "guessed" in table.inner_text()
+    page.get_by_text("What reading did to the log").click()
     looks(page, "guessed")
     for ours, name in (("n_dem", "N1_DEM"), ("n_r", "N1"), ("x_lvdt", "ACT_POS")):
         page.get_by_label(f"name of {ours} in the log").fill(name)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-__all__ = ["MOST_ROWS", "Note", "counted"]
+__all__ = ["COLUMNS", "MOST_ROWS", "Note", "as_rows", "counted", "told"]
 
 MOST_ROWS = 20  # that a note lists; it counts all
+COLUMNS = ("done", "to", "how many", "rows", "in words")  # of `as_rows`
 
 
 class Note(str):
@@ -44,3 +45,21 @@ def counted(notes: Iterable[str]) -> list[dict[str, Any]]:
         for n in notes
         if isinstance(n, Note)
     ]
+
+
+def told(notes: Iterable[str]) -> dict[str, Any]:
+    """What JSON says of the notes: all of them as sentences, and those that count something as data."""
+    every = list(notes)
+    return {"notes": every, "done": counted(every)}
+
+
+def as_rows(done: Iterable[Mapping[str, Any]]) -> list[list[Any]]:
+    """What was done to a log, as JSON has it (`counted`), as the rows of a table; how many is None where that was not
+    counted.
+    """
+    out = []
+    for one in done:
+        listed, more = ", ".join(f"{r:,}" for r in one["rows"]), one["count"] - len(one["rows"])
+        listed += f" and {more:,} more" if listed and more > 0 else ""
+        out.append([one["kind"], one["of"], one["count"] or None, listed, one["said"]])
+    return out

@@ -14,7 +14,7 @@ import numpy as np
 from hil.logs.guess import Files
 from hil.logs.log import read_log
 from hil.logs.mapping import Bench
-from hil.logs.notes import counted
+from hil.logs.notes import told
 from hil.logs.opening import open_log, wanted_design_speed
 from hil.logs.source import LogError, find
 from hil.logs.table import Table
@@ -98,7 +98,7 @@ class Survey:
         rows = [{k: getattr(r, k) for k in Row.__dataclass_fields__ if k != "curve"} for r in self.rows]
         return {
             "log": self.path, "signals": rows, "open": self.open, "other": list(self.other), "why_not": self.other,
-            "notes": self.notes, "done": counted(self.notes),
+            **told(self.notes),
             "complaint": self.complaint, "design_rpm": self.design_rpm, "suggested_rpm": self.suggested_rpm,
         }  # fmt: skip
 

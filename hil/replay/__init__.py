@@ -18,7 +18,7 @@ from controller import load_calibration
 from hil.figures import error_figures
 from hil.logs import LogError
 from hil.logs.held import ANSWERS, COMMANDS, SAME, answers, held, phase_of_ticks, taken
-from hil.logs.notes import Note, counted
+from hil.logs.notes import Note, told
 from hil.loop.lockstep import FRAME, Stimulus, lockstep
 from plant import build_plant
 from vaneloop.base.signals import UNITS
@@ -227,6 +227,5 @@ def replay_json(result: ReplayResult) -> dict[str, Any]:
         "wall_s": result.wall_s,
         "state_hash": result.state_hash,
         "signals": [asdict(s) for s in result.signals],
-        "notes": result.notes,
-        "done": counted(result.notes),
+        **told(result.notes),
     }

@@ -18,6 +18,7 @@ from controller import FAULTS, MODES
 from hil.bus.frames import R_GOOD, R_LOST, R_UNAUTHENTIC
 from hil.bus.port import Port
 from hil.engine_test import load_profile
+from hil.logs.notes import told
 from hil.loop import ecu
 from hil.loop.ecu import EcuStation, Typed
 from hil.loop.node import Ecu
@@ -224,7 +225,7 @@ def command(args: argparse.Namespace) -> int:
         "frames": {"sent": report.sent, "refused": port.refused, "good": good, "lost": lost,
         "lost_by_reader": port.lost, "unauthentic": unauthentic},
         "secoc": station.authentication_json(args, node),
-        **station.realtime_json(report), "notes": [*read_notes, *notes], "complaint": complaint,
+        **station.realtime_json(report), **told([*read_notes, *notes]), "complaint": complaint,
     })  # fmt: skip
     return 1 if complaint else 0
 

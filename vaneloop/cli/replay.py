@@ -11,7 +11,7 @@ from typing import Any
 
 from hil.logs import Channel, write_log
 from hil.logs.formats import FORMATS, listed
-from hil.logs.notes import counted
+from hil.logs.notes import told
 from hil.loop.lockstep import warm_up
 from hil.native import Program, crash_log
 from hil.native.crash_log import is_crash_log
@@ -125,7 +125,7 @@ def replayed(
     for line in exceeded:
         terminal.say(args, f"differs: {line}")
     notes = list(dict.fromkeys([*said, *result.notes]))
-    more = {**(extra or {}), "notes": notes, "done": counted(notes)}
+    more = {**(extra or {}), **told(notes)}
     answer = dataclasses.replace(answer, exceeded=exceeded, more=more)
     terminal.write_json(args, answer.to_dict())
     if args.report:

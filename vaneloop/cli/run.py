@@ -15,6 +15,7 @@ from hil.bus.port import Port
 from hil.bus.wire import BIT_RATE, BITS_PER_TICK
 from hil.calibrate.station import replay_attended
 from hil.fmu.plant_fmu import PlantFmu, PlantNode
+from hil.logs.notes import told
 from hil.logs.recorder import Recorder, check_name
 from hil.logs.recordings import read_record
 from hil.loop.node import Ecu, Node, replay
@@ -350,7 +351,7 @@ def _in_lockstep(args: argparse.Namespace) -> int:
         "wall_s": run.wall_s,
         "bus_load": run.load, "frames": {"on_the_bus": run.frames, "error_frames": run.error_frames},
         **_node_json(node), "secoc": station.authentication_json(args, secured),
-        "record": record, **({"notes": notes} if args.log or args.profile else {}), "exceeded": [],
+        "record": record, **(told(notes) if args.log or args.profile else {}), "exceeded": [],
     })  # fmt: skip
     return 0
 

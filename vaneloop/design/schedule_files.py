@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.logs.notes import told
 from plant import Geometry, Schedules
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import write, write_all
@@ -166,7 +167,7 @@ def result_json(result: ScheduleResult) -> dict[str, Any]:
             for k, s in enumerate(result.links)
         ],
         "loops": {name: {key: getattr(m, key) for key in LOOP_FIGURES} for name, m in result.loops.items()},
-        "notes": result.notes,
+        **told(result.notes),
     }
 
 

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hil.logs.notes import Note, counted
+from hil.logs.notes import COLUMNS, Note, as_rows, counted
 from vaneloop.base.files import write
 from vaneloop.base.version import installed_version
 from vaneloop.pages.figures import Figure
@@ -128,13 +128,8 @@ class Page:
         """Add a table of what was done to a log, as JSON has it (`hil.logs.notes.counted`); nothing where there is
         nothing.
         """
-        rows = []
-        for one in done:
-            listed, more = ", ".join(f"{r:,}" for r in one["rows"]), one["count"] - len(one["rows"])
-            listed += f" and {more:,} more" if listed and more > 0 else ""
-            rows.append([one["kind"], one["of"], one["count"] or None, listed, one["said"]])
-        if rows:
-            self.table(["done", "to", "how many", "rows", "in words"], rows, "What reading did to the log.")
+        if rows := as_rows(done):
+            self.table(list(COLUMNS), rows, "What reading did to the log.")
 
     def plot(self, figure: Any, caption: str = "", *, half: bool = False) -> None:
         """Add a plot; two ``half`` ones in a row stand side by side where the screen is wide enough."""

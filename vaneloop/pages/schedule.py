@@ -195,8 +195,7 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
         ],
         rows,
     )
-    if result.notes:
-        page.section("Notes", "\n\n".join(result.notes))
+    page.notes(result.notes)
     return page.write(path)
 
 

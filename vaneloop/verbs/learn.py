@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hil.logs.notes import Note, counted
+from hil.logs.notes import Note, told
 from plant import write_model
 from plant.model import Learned as Table
 from vaneloop.base.errors import InputError
@@ -109,7 +109,7 @@ class Learned(Answer):
         out: dict[str, object] = {
             "schema": 1, "log": self.log, "verdict": self.verdict, "sentence": self.sentence(),
             "laws": [law_json(law) for law in self.laws], "nearest": self.outcome.nearest, "model": self.path,
-            "named": self.diagnosed.effects, "notes": [*self._read, *self.notes], "done": counted(self._read),
+            "named": self.diagnosed.effects, **told([*self._read, *self.notes]),
         }  # fmt: skip
         out["decisions"] = [one for name, of in self.decisions.items() for one in decisions_json(of, stage=name)]
         out |= {"steps": dict(self.steps)} if self.steps else {}

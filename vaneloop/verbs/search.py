@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, cast
 
 import numpy as np
 
-from hil.logs.notes import counted
+from hil.logs.notes import counted, told
 from plant import write_model
 from plant.curve import PLACES
 from plant.effects import EFFECTS
@@ -309,13 +309,13 @@ class Experiment(Answer):
         """The answer as the JSON of ``vaneloop experiment``."""
         e, notes = self.recommended, self.diagnosed.diagnosis.notes
         if e is None:
-            return {"schema": 1, "log": self.log, "recommended": None, "profiles": [], "notes": notes}
+            return {"schema": 1, "log": self.log, "recommended": None, "profiles": []} | told(notes)
         score = "nats" if "nats" in e["heads"] else "score"
         best = {
             score: e["score"], "profile": e["profile"], "repeats": e["repeats"], "separates": e["separates"],
             "text": e["text"],
         }  # fmt: skip
-        return {"schema": 1, "log": self.log, "recommended": best, "profiles": e["table"], "notes": notes}
+        return {"schema": 1, "log": self.log, "recommended": best, "profiles": e["table"]} | told(notes)
 
     def rows(self) -> list[Row]:
         """A row for each profile that was tried."""

@@ -13,7 +13,7 @@ from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES
 from vaneloop.verbs.machine import files_of
 from vaneloop.web.charts import OVER, Chart
-from vaneloop.web.frame import Live, card, drop, list_of_moments, opened, table
+from vaneloop.web.frame import Live, card, drop, list_of_moments, notes_of, opened, table
 from vaneloop.web.session import CODE, OTHER_SUFFIXES, STOPPED, LogFile, Session, safe_name
 
 __all__ = ["ChosenLog", "receive", "suffixes"]
@@ -220,8 +220,7 @@ class ChosenLog:
         s = self.s
         if s.preview is not None:
             guesses = [n for n in s.preview["notes"] if "guessed to be" in n]
-            for note in [n for n in s.preview["notes"] if n not in guesses][:6]:
-                ui.label(f"note: {note}").classes("note")
+            notes_of(s, "What reading did to the log", s.preview["notes"], guesses)
             if guesses:
                 what = "1 name or unit is" if len(guesses) == 1 else f"{len(guesses)} names and units are"
                 ui.label(f"note: {what} guessed; see below").classes("note")

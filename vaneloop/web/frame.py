@@ -15,6 +15,7 @@ from typing import Any
 from nicegui import ui
 from nicegui.element import Element
 
+from hil.logs.notes import COLUMNS, as_rows, counted
 from vaneloop.identification.regimes import agrees
 from vaneloop.pages.style import THEMES
 from vaneloop.web.charts import figure as figure_of
@@ -23,13 +24,15 @@ from vaneloop.web.moments import Moment
 from vaneloop.web.session import STOPPED, Session
 
 __all__ = [
-    "PAGES", "Live", "card", "command_line", "drop", "figure_of", "frame", "list_of_moments", "opened", "table", "tone",
+    "PAGES", "Live", "card", "command_line", "drop", "figure_of", "frame", "list_of_moments", "notes_of", "opened",
+    "table", "tone",
 ]  # fmt: skip
 
 PAGES = (("/", "Missing physics"), ("/schedule", "Schedule"), ("/run", "Run"), ("/fleet", "Fleet"))
 LOG = logging.getLogger("nicegui")  # whose lines the server prints in plain words
 PRIMARY = "#1f6fc4"
 MOMENTS = 200  # that are listed
+NOTES = 6  # that stand on a page as sentences
 FAILED = (
     "a part of this page failed, which is a defect of VaneLoop; where the workbench was started a line says which. "
     "Reload the page: what was read and found is still there"
@@ -364,6 +367,15 @@ def opened(session: Session, title: str, now: bool = False) -> ui.expansion:
         title, value=now or kept.get(title, False), on_value_change=lambda e: kept.__setitem__(title, bool(e.value))
     )
     return box.classes("w-full").props("dense")
+
+
+def notes_of(session: Session, title: str, notes: Sequence[str], said: Sequence[str] = ()) -> None:
+    """Notes on a log: the first as sentences, but for those ``said`` elsewhere; what was done to it, in a table."""
+    for note in [n for n in notes if n not in said][:NOTES]:
+        ui.label(f"note: {note}").classes("note")
+    if rows := as_rows(counted(notes)):
+        with opened(session, title):
+            table(COLUMNS, [["" if c is None else c for c in row] for row in rows], numbers=(2,))
 
 
 def list_of_moments(

@@ -32,7 +32,7 @@ from vaneloop.pages.story import (
 from vaneloop.pages.style import capital, number
 from vaneloop.web.charts import Chart
 from vaneloop.web.chosen_log import ChosenLog
-from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame, opened, table, tone
+from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame, notes_of, opened, table, tone
 from vaneloop.web.learning import LearnedPart
 from vaneloop.web.session import LogFile, Session
 
@@ -130,6 +130,8 @@ class _Page:
         ]
         as_given = f" With the parameters as given, in noise floors: {', '.join(given)}." if given else ""
         ui.label(f"Nominal parameters are refitted within their tolerances.{as_given}").classes("note")
+        known = s.preview["notes"] if s.preview else []
+        notes_of(s, "What judging did to the log", [n for n in c["notes"] if n not in known])
         self.live.part(self._whole_loop, "compare", "loop", shows=lambda: (s.loop,))
         command_line(s.command("compare"))
         command_line(s.command("locate"))

@@ -24,7 +24,7 @@ from vaneloop.pages.schedule import NAMES
 from vaneloop.pages.style import STAGE_ROLES
 from vaneloop.verbs.machine import files_of
 from vaneloop.web.chosen_log import receive, suffixes
-from vaneloop.web.frame import Live, card, command_line, dark, drop, figure_of, frame, opened, table
+from vaneloop.web.frame import Live, card, command_line, dark, drop, figure_of, frame, notes_of, opened, table
 from vaneloop.web.jobs import STEPS
 from vaneloop.web.session import LogFile, Session
 
@@ -457,8 +457,7 @@ class _Page:
                     }
                     trace["marker"] |= {"size": 3, "opacity": 0.45}
                 figure_of(f, dark(self.s), 380)
-        for note in r.notes[:5]:
-            ui.label(f"note: {note}").classes("note")
+        notes_of(self.s, "What was done to the log", r.notes)
 
     def _tables(self, answer: dict[str, Any]) -> None:
         r = answer["result"]
@@ -490,6 +489,5 @@ class _Page:
                 for k, n, role in ((1, "extension", "measured"), (2, "retraction", "model"), (3, "mean", "target"))
             ]
             figure_of(overlay([Panel("stroke [mm]", lines)], "rotor speed [%]"), dark(self.s), 360)
-        for note in r.notes[:5]:
-            ui.label(f"note: {note}").classes("note")
+        notes_of(self.s, "What was done to the log", r.notes)
         command_line("vaneloop engine-test --tables engine/", "what remains in an engine test with these tables")
