@@ -322,7 +322,7 @@ def test_the_phase_of_the_ticks_is_found_whatever_the_jitter(tenths: int, jitter
 def test_rows_stand_at_the_answers_of_a_log_of_frames(tmp_path: Path) -> None:
     """Else rows half-way between two answers would flip from one to the other."""
     log = read_log(by_wire(tmp_path / "run.log", "slam", 5.0, seconds=15.0))
-    t, columns, _, _, _ = on_raster(log, grid_of(log))
+    t, columns, _, _ = on_raster(log, grid_of(log))
     c = log.channels["x_lvdt"]
     assert len(t) > 1400
     assert np.isin(columns["x_lvdt"], c.values).all()

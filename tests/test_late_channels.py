@@ -159,6 +159,30 @@ def test_every_command_that_reads_a_log_counts_in_json_what_it_did(
     assert said["done"][0]["said"] in said["notes"]
 
 
+@pytest.mark.parametrize("name", [*CUT, *(pytest.param(name, marks=pytest.mark.slow) for name in MORE_CUT)])
+def test_a_gap_counts_only_in_what_uses_the_channel(name: str) -> None:
+    rng = np.random.default_rng(len(name))
+    begin = rng.uniform(8.0, 20.0)
+    end = begin + rng.uniform(3.0, 10.0)
+    c = a_log().channels[name]
+    there = (c.t < begin) | (c.t > end)
+    log = replace(a_log(), channels={**a_log().channels, name: replace(c, t=c.t[there], values=c.values[there])})
+    before, after = ({s.name: s for s in chain.stages} for chain in (whole(), build_chain(log)))
+    for stage, one in before.items():
+        t, counts, now = one.t, np.isfinite(one.measured), np.isfinite(after[stage].measured)
+        settled = end + 3.0 if stage != "linkage" or name in VANES else SECONDS  # play is known from a reversal on
+        gap = (t > begin - 1.0) & (t < settled)  # in whole windows
+        for output, was, still in zip(one.outputs, counts, now, strict=True):
+            mine = output == name if name in VANES else name in used(stage)
+            lost = was & ~still
+            assert lost.any() == mine and not lost[~gap].any(), (stage, output)
+            if mine:
+                assert not still[(t > begin + 0.1) & (t < end - 0.1)].any()
+        for condition, values in one.regimes.items():
+            known = np.isfinite(after[stage].regimes[condition])
+            assert known[~gap].all() and np.isfinite(values).all()
+
+
 def test_an_excerpt_of_a_long_log_is_cut_likewise() -> None:
     log = between(a_log(), "i_cmd", 12.0, SECONDS)
     grid = grid_of(log)

@@ -413,7 +413,7 @@ def shape(judge: LeastSquaresProblem, fit: Fit, noise: float = 1.0) -> list[Shap
                 features[f"{name}, against the motion"] = (v, y * direction, stage.regime_units.get(name, ""))
         best: tuple[float, str, Array, Array, str] | None = None
         for name, (v, target, x_unit) in features.items():
-            ok = use & np.isfinite(v)
+            ok = use & np.isfinite(v) & np.isfinite(target)
             if ok.sum() < 200 or np.ptp(v[ok]) == 0.0:
                 continue
             edges = _edges(v[ok])

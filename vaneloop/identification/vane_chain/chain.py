@@ -20,10 +20,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 
 from controller import Calibration, load_calibration
 from controller.records import RUN
@@ -70,6 +69,7 @@ from vaneloop.identification.vane_chain.engine import engine_stage
 from vaneloop.identification.vane_chain.linkage import linkage_stage
 from vaneloop.identification.vane_chain.resample import (
     OF_SUBSYSTEM,
+    Gaps,
     Grid,
     every_other,
     grid_of,
@@ -262,7 +262,7 @@ def _chain(
     known = {c: grid.rows_of(c) for c in log.channels}
     part = {c: known[c] for c in known if known[c][0] > low or known[c][1] < high}
     here = log if not part else log[[c for c in known if c not in part or c in explained]]
-    t, columns, fresh, lacking, notes = on_raster(here, grid, pieces)
+    t, columns, gaps, notes = on_raster(here, grid, pieces)
     if len(t) < 500:
         raise LogError(
             f"{log.path}: {len(t)} samples of {t[1] - t[0] if len(t) > 1 else 0:g} s; at least 500 are needed to "
@@ -271,26 +271,20 @@ def _chain(
     dt = float(t[1] - t[0])
     behind, late = demand_of(late)
     columns = aligned(t, columns, late)
-    # after a gap everything is as at the start of a log: what the stages remember must come from the rows behind it
-    fresh = ~scipy.ndimage.binary_propagation(~fresh, mask=~fresh | lacking)
-    stretch = stretches(fresh)
-    usable = fresh & (since(t, stretch) >= SETTLE) & no_gap_in_window(t, fresh)
-    run = law_holds = machine_rows = currents = usable
-    spell = machine_spell = stretch
-    if "state" in columns:
-        running = np.round(columns["state"]) == RUN
-        run = usable & running
-        spell = stretches(fresh & running)  # nor is it known what a controller in another mode has made of the demand
-        law_holds = run & (since(t, spell) >= SETTLE)  # back in RUN, it first catches up
+    running = np.round(columns["state"]) == RUN if "state" in columns else None
+    mostly, share = True, 1.0
+    if running is not None:
         # the machine obeys its physics in any mode; where the controller mostly stood aside, that is all there is
-        share = float(run.sum()) / max(float(usable.sum()), 1.0)
-        machine_rows = run if share >= 0.5 else usable
-        machine_spell = spell if share >= 0.5 else stretch
-        currents = law_holds if share >= 0.5 else usable  # between two rows they follow from the firmware's law
-        if share < 0.5:
+        usable = _rows(t, gaps, (), running, True).usable
+        share = float((usable & running).sum()) / max(float(usable.sum()), 1.0)
+        mostly = share >= 0.5
+        if not mostly:
             notes.append(
                 f"state: mode RUN in {share:.0%} of the log; engine, actuator and linkage are judged in all modes"
             )
+    # the stroke between its rows follows from what the actuator knows, the current between its own from the servo, too
+    motion = _rows(t, gaps, _used("actuator"), running, mostly)
+    both = _rows(t, gaps, (*_used("actuator"), *_used("servo")), running, mostly)
     foreign = [v for v in VANES if v in columns and v not in machine.vanes]
     notes += [f"{v}: this machine has no such vane row (geometry); not judged" for v in foreign]
     if room_for(machine.p) < MOST_CURVES:
@@ -300,10 +294,12 @@ def _chain(
         if lost := next((q.name for q in QUANTITIES.values() if q.of in of and q.name not in logged), None):
             raise LogError(f"{log.path}: has no {lost}, of which a learned law of the model is a function")
     filled = machine.usual
-    have = {**columns, "stretch": stretch, "spell": spell, "machine_spell": machine_spell}
-    have |= {"fresh": fresh.astype(float), "missing": lacking.astype(float)}
+    have = {**columns, **motion.columns()}
     for name in explained & columns.keys():
-        if (there := _sampled(log.channels[name], t, grid, known[name])) is not None:
+        there = _sampled(log.channels[name], t, grid, known[name])
+        if name in VANES and name in gaps.far:  # a gap of one vane is none of the others
+            there = gaps.fresh([name])[0] & (True if there is None else there)
+        if there is not None:
             have[SAMPLED_OF + name] = there.astype(float)
     for name, value in filled.items():
         if name not in have:
@@ -316,13 +312,13 @@ def _chain(
             )
     full = machine.table.actuator.stroke.value
     if {"x_lvdt", "i_cmd"} <= columns.keys():
-        rough = Driven(t, have, machine, cal, (), usable, (), turns=partial(reversals, t, have["x_lvdt"], full))
+        rough = Driven(t, have, machine, cal, (), motion.usable, (), turns=partial(reversals, t, have["x_lvdt"], full))
         smooth = without_noise(t, have, machine, rough.slipping(rough.signals(), machine.p))
     if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
         if "x_dem" in columns and not theirs and {"servo", "actuator"} & set(names):
             samples = min(10, max(1, round(dt / grid.steps["i_cmd"])))
             law, *off = servo_law(t, have, cal, smooth, draws, samples, behind)
-            what = other_current(t, have, law, run, cal, samples)
+            what = other_current(t, have, law, both.run, cal, samples)
             if what:
                 notes.append(
                     f"i_cmd: {what}, not the mean of those since the row before, which is worked out from stroke and "
@@ -336,12 +332,12 @@ def _chain(
             unknown = off[0][:, 0] - off[1][:, 0] if sampled else None
             size = cal.scalars.kp * smooth.noise
             have["ticks"], have["other_ticks"] = (
-                between_rows(have, law, size, run, cal, unknown, seed) for seed in (0, 1)
+                between_rows(have, law, size, both.run, cal, unknown, seed) for seed in (0, 1)
             )
         have["stroke"] = smooth.stroke
     coarse_current = None
     if dt > 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
-        what = _slow_current(Driven(t, have, machine, cal, ("x_lvdt",), currents, present))
+        what = _slow_current(Driven(t, have, machine, cal, ("x_lvdt",), motion.currents, present))
         if what:
             notes.append(f"i_cmd: {what}, not the mean since the row before, which is worked out from it")
             coarse_current = SLOW_CURRENTS[what](columns["i_cmd"][::2])
@@ -351,7 +347,7 @@ def _chain(
     if "x_lvdt" in columns:
         stroke = have.get("stroke", columns["x_lvdt"])
         turns = lru_cache(partial(reversals, t, stroke, full))
-    regimes, units = regimes_of(t, columns)
+    regimes, units = regimes_of(t, columns, gaps)
     step = _lost_step(log, machine)
     bits = _lost_bits(step, machine)
     steps = {"x_lvdt": step} if step else {}
@@ -365,8 +361,10 @@ def _chain(
         if name in ("servo", "demand") and dt > 1.5 * RASTER:
             absent[name] = f"sample time of {dt:g} s; the controller works every 0.01 s"
             continue
-        rows = law_holds if name in ("servo", "demand") else currents if name == "actuator" else machine_rows
-        driven = Driven(t, have, machine, cal, outputs, rows, present, turns=turns)
+        own = _rows(t, gaps, _used(name), running, mostly)
+        rows = own.law_holds if name in ("servo", "demand") else own.currents if name == "actuator" else own.machine
+        have |= own.columns()
+        driven = Driven(t, dict(have), machine, cal, outputs, rows, present, turns=turns)
         make = make_of[name]
         stage = make(driven)
         stage.regimes, stage.regime_units = regimes, units
@@ -384,10 +382,10 @@ def _chain(
             stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
         if (apart := max(round(log.channels[c].apart / dt) for c in needs)) > 1:
             more = np.zeros(len(outputs))
-            own, half = np.arange(0, len(t), 2 * apart), np.minimum(np.arange(len(t)) + apart // 2, len(t) - 1)
+            true, half = np.arange(0, len(t), 2 * apart), np.minimum(np.arange(len(t)) + apart // 2, len(t) - 1)
             slow = [c for c in needs if log.channels[c].apart > 1.5 * dt]
             # what half of the true samples cost, or half the time between two, is more than what the lines do
-            for other in ({c: np.interp(t, t[own], have[c][own]) for c in slow}, {c: have[c][half] for c in slow}):
+            for other in ({c: np.interp(t, t[true], have[c][true]) for c in slow}, {c: have[c][half] for c in slow}):
                 varied = make(driven._replace(columns=have | other))
                 change = stage.run(stage.neutral()[None])[0] - varied.run(varied.neutral()[None])[0]
                 more = np.maximum(more, rms(stage, change))
@@ -406,6 +404,65 @@ def _chain(
         stage.floor = noise_of(stage, stage.neutral())
         stages.append(stage)
     return Chain(t, stages, absent, columns, machine, tables, cal, notes, steps, start=grid.start)
+
+
+class _Rows(NamedTuple):
+    """Which rows of a log count in a subsystem, each bool[rows], and the stretches without a gap in its channels.
+
+    usable                 no gap in its channels near, and it has had time to settle
+    run                    in mode RUN
+    law_holds              and the firmware has caught up
+    machine                those that count in the machine
+    currents               and those in which a current follows from the firmware's law between two rows, too
+    stretch, spell, machine_spell  number of the stretch; in mode RUN; of those that count in the machine
+    fresh, missing         no gap in its channels; one of them misses a sample
+    """
+
+    usable: Array
+    run: Array
+    law_holds: Array
+    machine: Array
+    currents: Array
+    stretch: Array
+    spell: Array
+    machine_spell: Array
+    fresh: Array
+    missing: Array
+
+    def columns(self) -> dict[str, Array]:
+        """What the stages ask for."""
+        return {
+            "stretch": self.stretch, "spell": self.spell, "machine_spell": self.machine_spell,
+            "fresh": self.fresh.astype(float), "missing": self.missing.astype(float),
+        }  # fmt: skip
+
+
+def _used(name: str) -> tuple[str, ...]:
+    """Channels whose gaps count in a subsystem: what drives it, what it explains but for the vanes, of which each has
+    gaps of its own.
+    """
+    of = OF_SUBSYSTEM[name]
+    return (*of.needs, *of.takes, *(c for c in of.gives if c not in VANES))
+
+
+def _rows(t: Array, gaps: Gaps, names: Sequence[str], running: Array | None, mostly: bool) -> _Rows:
+    """The rows that count where these channels and ``state`` do.
+
+    running  at which rows the controller is in mode RUN; None: nobody says
+    mostly   whether it mostly is: else the machine is judged in all modes
+    """
+    # after a gap everything is as at the start of a log: what the stages remember must come from the rows behind it
+    fresh, missing = gaps.fresh((*names, "state"))
+    stretch = stretches(fresh)
+    usable = fresh & (since(t, stretch) >= SETTLE) & no_gap_in_window(t, fresh)
+    if running is None:
+        return _Rows(usable, usable, usable, usable, usable, stretch, stretch, stretch, fresh, missing)
+    run = usable & running
+    spell = stretches(fresh & running)  # nor is it known what a controller in another mode has made of the demand
+    law_holds = run & (since(t, spell) >= SETTLE)  # back in RUN, it first catches up
+    if not mostly:
+        return _Rows(usable, run, law_holds, usable, usable, stretch, spell, stretch, fresh, missing)
+    return _Rows(usable, run, law_holds, run, law_holds, stretch, spell, spell, fresh, missing)
 
 
 def _slow_current(driven: Driven) -> str:

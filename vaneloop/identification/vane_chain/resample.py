@@ -1,15 +1,16 @@
 """A log of the vanes on one raster: 10 ms, the ECU frame's period, or the log's own where that is slower; which rows
-each subsystem has; which of them count; and the conditions under which a stage may fail.
+each subsystem has; where channels have gaps; and the conditions under which a stage may fail.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from hil.figures import noise_floor
 from hil.logs import Channel, Log, LogError
@@ -23,6 +24,7 @@ from vaneloop.identification.subsystem import Array, Stage
 
 __all__ = [
     "OF_SUBSYSTEM",
+    "Gaps",
     "Grid",
     "OfSubsystem",
     "every_other",
@@ -129,11 +131,34 @@ def grid_of(log: Log) -> Grid:
     return Grid(start, dt, rows, steps, {name: s for name, s in of_each.items() if s != (0, rows)})
 
 
+class Gaps(NamedTuple):
+    """Rows at which channels have no sample near, each bool[rows].
+
+    border  rows at the border of two pieces of a log: none has one there
+    far     channel -> rows far from its samples
+    lost    channel -> rows at which a sample of its own is missing
+    """
+
+    border: Array
+    far: Mapping[str, Array]
+    lost: Mapping[str, Array]
+
+    def fresh(self, names: Iterable[str]) -> tuple[Array, Array]:
+        """At which rows all of these channels are known, and at which one of them misses a sample.
+
+        Rows at the end of a gap, filled from one side alone, are in the gap.
+        """
+        far, lost = self.border, np.zeros(len(self.border), dtype=bool)
+        for name in names:
+            if name in self.far:
+                far, lost = far | self.far[name], lost | self.lost[name]
+        return ~scipy.ndimage.binary_propagation(far, mask=far | lost), lost
+
+
 def on_raster(
     log: Log, grid: Grid, pieces: Sequence[tuple[int, int]] = ()
-) -> tuple[Array, dict[str, Array], Array, Array, list[str]]:
-    """All channels on one uniform raster; which samples are near measured ones; at which some channel misses a row of
-    its own; notes.
+) -> tuple[Array, dict[str, Array], Gaps, list[str]]:
+    """All channels on one uniform raster; where they have gaps; notes.
 
     pieces  (first row, row behind the last), ascending, in whole windows: only these rows of a long log, each piece as
             behind a gap; all on the raster of the whole log. Default: all rows
@@ -142,17 +167,25 @@ def on_raster(
     """
     if not pieces:
         t = np.arange(grid.rows) * grid.dt
-        return t, *_columns(log.channels, grid, t), list(log.notes)
+        columns, far, lost = _columns(log.channels, grid, t)
+        return t, columns, Gaps(np.zeros(len(t), dtype=bool), far, lost), list(log.notes)
     parts = []
     for first, behind in pieces:
         t = np.arange(first, behind) * grid.dt
         low, high = (grid.start + k * grid.dt for k in (first - grid.window, behind + grid.window))
         parts.append((t, *_columns({k: _between(c, low, high) for k, c in log.channels.items()}, grid, t)))
-    times, columns, fresh, missing = zip(*parts, strict=True)
-    for before, after in itertools.pairwise(fresh):  # a smoothing filter, or a spline, looks across the border
-        before[-1] = after[0] = False
-    joined = {name: np.concatenate([c[name] for c in columns]) for name in log.channels}
-    return np.concatenate(times), joined, np.concatenate(fresh), np.concatenate(missing), list(log.notes)
+    times, columns_of, far_of, lost_of = zip(*parts, strict=True)
+    borders = [np.zeros(len(t), dtype=bool) for t in times]
+    for before, after in itertools.pairwise(borders):  # a smoothing filter, or a spline, looks across the border
+        before[-1] = after[0] = True
+    joined = {name: np.concatenate([c[name] for c in columns_of]) for name in log.channels}
+
+    def whole(rows: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+        none = [np.zeros(len(t), dtype=bool) for t in times]
+        names = dict.fromkeys(name for of in rows for name in of)
+        return {n: np.concatenate([of.get(n, z) for of, z in zip(rows, none, strict=True)]) for n in names}
+
+    return np.concatenate(times), joined, Gaps(np.concatenate(borders), whole(far_of), whole(lost_of)), list(log.notes)
 
 
 def _between(c: Channel, low: float, high: float) -> Channel:
@@ -161,8 +194,10 @@ def _between(c: Channel, low: float, high: float) -> Channel:
     return Channel(c.t[use], c.values[use], c.framed)
 
 
-def _columns(channels: Mapping[str, Channel], grid: Grid, t: Array) -> tuple[dict[str, Array], Array, Array]:
-    """`on_raster` at rows ``t`` (s from its start): channels, which rows are fresh, at which one is missing."""
+def _columns(
+    channels: Mapping[str, Channel], grid: Grid, t: Array
+) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array]]:
+    """`on_raster` at rows ``t`` (s from its start): channels, and of those with gaps what `Gaps` says of them."""
     dt, first = grid.dt, grid.start
     reference = answers(channels) or max((c for c in channels.values()), key=lambda c: len(c.t))
     own = float(np.median(np.diff(reference.t)))
@@ -170,8 +205,7 @@ def _columns(channels: Mapping[str, Channel], grid: Grid, t: Array) -> tuple[dic
     phase = float(np.median((reference.t - first + 0.5 * own) % own) - 0.5 * own) if own >= 0.5 * dt else 0.0
     when = t + first + phase
     had = taken(channels, when, 0.5 * dt)
-    fresh, missing = np.ones(len(t), dtype=bool), np.zeros(len(t), dtype=bool)
-    columns = {}
+    columns, far, missing = {}, dict[str, Array](), dict[str, Array]()
     row = np.rint(t / dt)
     for name, c in channels.items():
         if len(c.t) < 2:
@@ -181,9 +215,11 @@ def _columns(channels: Mapping[str, Channel], grid: Grid, t: Array) -> tuple[dic
         if name in COMMANDS and c.framed:
             i = held(c, had)
             columns[name], age = c.values[i], had - c.t[i]
-            fresh &= age < 3.0 * max(step, dt)  # two frames are bridged, as two rows are below
             lost = np.append(np.diff(c.t), step) > 1.5 * max(step, dt)
-            missing |= lost[i] & (age > 0.75 * step)
+            # two frames are bridged, as two rows are below
+            gone, lacks = age >= 3.0 * max(step, dt), lost[i] & (age > 0.75 * step)
+            if gone.any() or lacks.any():
+                far[name], missing[name] = gone, lacks
             continue
         uniform = np.abs(np.diff(c.t) - step) < 0.3 * step
         if name == "i_cmd" and step < 0.6 * dt:
@@ -206,9 +242,11 @@ def _columns(channels: Mapping[str, Channel], grid: Grid, t: Array) -> tuple[dic
         if name in grid.known:  # a gap is between samples; before the first and after the last there is none
             low, behind = grid.rows_of(name)
             away[(row < low) | (row >= behind)] = 0.0
-        fresh &= away < 1.5 * max(step, dt)  # one or two rows are bridged, more are a gap
-        missing |= away > 0.75 * max(step, dt)
-    return {name: no_smaller(v) for name, v in columns.items()}, fresh, missing
+        # one or two rows are bridged, more are a gap
+        gone, lacks = away >= 1.5 * max(step, dt), away > 0.75 * max(step, dt)
+        if lacks.any():
+            far[name], missing[name] = gone, lacks
+    return {name: no_smaller(v) for name, v in columns.items()}, far, missing
 
 
 def _between_rows(c: Channel, when: Array, dt: float) -> bool:
@@ -291,8 +329,14 @@ def lately(rows: Array, seconds: float, dt: float = RASTER) -> Array:
     return np.asarray(n - np.maximum.accumulate(np.where(rows, n, -np.inf)) < seconds / dt)
 
 
-def regimes_of(t: Array, columns: dict[str, Array]) -> tuple[dict[str, Array], dict[str, str]]:
-    """Conditions under which a stage may fail, each without its sensor's noise (`steady`)."""
+def regimes_of(t: Array, columns: dict[str, Array], gaps: Gaps) -> tuple[dict[str, Array], dict[str, str]]:
+    """Conditions under which a stage may fail, each without its sensor's noise (`steady`); NaN in the gaps of their
+    channels.
+    """
+
+    def known(name: str, values: Array) -> Array:
+        return np.where(gaps.fresh([name])[0], values, np.nan) if name in gaps.far else values
+
     columns = {c: steady(v, CONDITION_BAND * noise_floor(t, v)) for c, v in columns.items() if c in CONDITIONS}
     out: dict[str, Array] = {"time": t}
     units = {"time": "s"}
@@ -305,15 +349,16 @@ def regimes_of(t: Array, columns: dict[str, Array]) -> tuple[dict[str, Array], d
         out |= {"stroke": x, "stroke speed": v, "direction": np.sign(np.where(np.abs(v) > 0.2, v, 0.0))}
         units |= {"stroke": "mm", "stroke speed": "mm/s", "direction": ""}
         out["distance since reversal"], units["distance since reversal"] = _since_reversal(smooth, v), "mm"
+        out = {name: v if name == "time" else known("x_lvdt", v) for name, v in out.items()}
     for name, label, unit in (
         ("n_r", "rotor speed", "%"),
         ("t_oil", "oil temperature", "degC"),
         ("p_s", "supply pressure", "MPa"),
     ):
         if name in columns:
-            out[label], units[label] = columns[name], unit
+            out[label], units[label] = known(name, columns[name]), unit
     if "i_cmd" in columns:
-        out["current"], units["current"] = columns["i_cmd"], "mA"
+        out["current"], units["current"] = known("i_cmd", columns["i_cmd"]), "mA"
     return out, units
 
 
