@@ -22,7 +22,7 @@ from vaneloop.cli.main import main
 from vaneloop.identification import Record, System, unknown
 from vaneloop.identification.user_models.data import Data
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
-from vaneloop.identification.vane_chain.resample import OF_SUBSYSTEM, grid_of
+from vaneloop.identification.vane_chain.resample import OF_SUBSYSTEM, grid_of, rms
 from vaneloop.verbs import long
 from vaneloop.verbs.machine import Machine
 from vaneloop.verbs.parts import read_record
@@ -178,6 +178,9 @@ def test_a_gap_counts_only_in_what_uses_the_channel(name: str) -> None:
             assert lost.any() == mine and not lost[~gap].any(), (stage, output)
             if mine:
                 assert not still[(t > begin + 0.1) & (t < end - 0.1)].any()
+        if name not in used(stage):  # nor does what the gap hides from others make it worse
+            error, was = (rms(s, s.measured - s.run(s.neutral()[None])[0]) for s in (after[stage], one))
+            assert np.allclose(error, was, rtol=0.05), stage
         for condition, values in one.regimes.items():
             known = np.isfinite(after[stage].regimes[condition])
             assert known[~gap].all() and np.isfinite(values).all()

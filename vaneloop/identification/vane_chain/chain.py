@@ -282,9 +282,10 @@ def _chain(
             notes.append(
                 f"state: mode RUN in {share:.0%} of the log; engine, actuator and linkage are judged in all modes"
             )
-    # the stroke between its rows follows from what the actuator knows, the current between its own from the servo, too
-    motion = _rows(t, gaps, _used("actuator"), running, mostly)
-    both = _rows(t, gaps, (*_used("actuator"), *_used("servo")), running, mostly)
+    # the stroke between its rows follows from stroke and current, and the current between its own from the servo, too:
+    # pressure, oil and speed change slowly, and a line through their gaps takes no motion out of the stroke
+    motion = _rows(t, gaps, ("i_cmd", "x_lvdt"), running, mostly)
+    both = _rows(t, gaps, _used("servo"), running, mostly)
     foreign = [v for v in VANES if v in columns and v not in machine.vanes]
     notes += [f"{v}: this machine has no such vane row (geometry); not judged" for v in foreign]
     if room_for(machine.p) < MOST_CURVES:
