@@ -84,12 +84,14 @@ def test_the_same_table_is_read_however_it_is_written(tmp_path: Path, text: str 
     assert set(log.channels) == {"n_dem"} and not log.channels["n_dem"].framed
 
 
-@pytest.mark.parametrize("none", ["", "NA", "N/A", "null", "None", "-", " NA ", "nan"])
+@pytest.mark.parametrize("none", ["", "NA", "N/A", "null", "None", "-", " NA ", "#N/A", "NULL", "--", "nan", "1.#QNAN"])
 def test_a_cell_without_a_sample_leaves_its_row_out(tmp_path: Path, none: str) -> None:
     for last in ("52", " 52"):  # plain numbers, and one by one
         log = read(csv(tmp_path, f"t,n_dem\n0,50\n1,{none}\n2,{last}\n"))
         assert log.channels["n_dem"].t.tolist() == [0, 2]
-        assert log.notes == (["n_dem (n_dem): 1 of 3 samples are NaN or infinite: left out"] if none == "nan" else [])
+        assert log.notes == (
+            ["n_dem (n_dem): 1 of 3 samples are NaN or infinite: left out"] if none in ("nan", "1.#QNAN") else []
+        )
 
 
 @pytest.mark.parametrize(
@@ -115,6 +117,16 @@ def test_what_is_no_table_is_refused_by_row_and_column(tmp_path: Path, text: str
         assert read(file).channels == {}
     else:
         assert said in refused(file)
+
+
+def test_space_behind_the_last_row_that_was_never_written_is_left_out(tmp_path: Path) -> None:
+    text = b"t,n_dem\n0,50\n1,51\n2,52\n"
+    for raw in (text, text + text[:9].replace(b"t,n_dem", b"3,53\n4,")):  # at the end of a row, and in one
+        log = read(csv(tmp_path, raw + b"\0" * 4096))
+        assert log.channels["n_dem"].values.tolist()[:3] == [50, 51, 52]
+        assert "rows: behind the last one stand 4,096 bytes of 0, as after a loss of power: left out" in log.notes
+    assert refused(csv(tmp_path, b"\0" * 64)) == "LOG: is not a CSV (binary bytes in it)"
+    assert "binary bytes" in refused(csv(tmp_path, text[:12] + b"\0" + text[12:]))
 
 
 def test_a_table_has_ten_thousand_columns_at_most(tmp_path: Path) -> None:
@@ -192,6 +204,17 @@ def test_times_of_any_arrow_type_are_seconds(tmp_path: Path, kind: Any, factor: 
     np.testing.assert_allclose(
         read(tmp_path / "a.parquet").channels["n_dem"].t, factor * np.array([1, 2, 4]), rtol=1e-12
     )
+
+
+def test_the_only_column_of_dates_is_the_time(tmp_path: Path) -> None:
+    when = pa.array([10, 11, 12], pa.timestamp("s"))
+    columns = {"n_dem": [50.0, 51.0, 52.0], "__index_level_0__": when}
+    pq.write_table(pa.table(columns), tmp_path / "a.parquet")
+    log = read(tmp_path / "a.parquet")
+    assert log.channels["n_dem"].t.tolist() == [10.0, 11.0, 12.0]
+    assert log.notes[0].startswith("t: guessed to be '__index_level_0__', the only column of dates")
+    pq.write_table(pa.table(columns | {"other": when}), tmp_path / "a.parquet")
+    assert "no time column" in refused(tmp_path / "a.parquet")
 
 
 def test_cells_of_any_number_and_dates_in_words_are_read_and_words_are_not(tmp_path: Path) -> None:
@@ -286,12 +309,29 @@ NINE = dt.datetime(2024, 3, 7, 9, 8, 7, 654321)
         "%Y-%m-%d %H:%M:%S.%f -0330",
         "%H:%M:%S.%f",
         "%d.%m.%Y %H:%M:%S,%f",
+        "%m/%d/%Y %I:%M:%S.%f %p",
+        "%d %b %Y %H:%M:%S.%f",
+        "%d-%B-%Y %H:%M:%S.%f",
+        "%b %d, %Y %H:%M:%S.%f",
+        "%Y-%m-%d %H:%M:%S.%f UTC",
     ],
 )
 @pytest.mark.parametrize("later", [1e-6, 0.25, 59.5, 3599.000001, 40_000.0])
 def test_dates_of_every_form_are_the_seconds_between_them(form: str, later: float) -> None:
     other = NINE + dt.timedelta(seconds=later)
     assert dates(NINE.strftime(form), None, other.strftime(form))[::2] == pytest.approx([0.0, later], abs=1e-9)
+
+
+@given(st.datetimes(dt.datetime(1970, 1, 1), dt.datetime(2068, 12, 31)), st.integers(1, 86_399_999_999))
+def test_halves_of_the_day_and_months_in_words_say_what_their_numbers_say(first: dt.datetime, later: int) -> None:
+    cells = [first, first + dt.timedelta(microseconds=later)]
+    want = dates(*(c.strftime("%Y-%m-%d %H:%M:%S.%f") for c in cells))
+    german = ("Jan", "Feb", "Mär", "Apr", "Mai", "Juni", "Juli", "Aug", "Sept.", "Okt", "Nov", "Dez")
+    for form in ("%Y-%m-%d %I:%M:%S.%f %p", "%d %b %Y %H:%M:%S.%f", "%B %d, %Y %I:%M:%S.%f%p"):
+        assert dates(*(c.strftime(form) for c in cells)) == want
+    assert dates(*(c.strftime(f"%d. {german[c.month - 1]} %Y %I:%M:%S.%f %p") for c in cells)) == want
+    cells = [c.strftime("%Y-%m-%d %I:%M %p") for c in cells]
+    assert dates(cells[0], cells[1][:-3]) == 1  # neither half: no time as the first one is
 
 
 def test_days_months_leap_years_and_centuries_count_as_in_the_calendar() -> None:

@@ -408,6 +408,17 @@ def test_channels_of_mdf_3_are_those_that_asammdf_reads(
         holds(read_log(tmp_path / name, require=()), columns)
 
 
+def test_samples_that_an_mdf_marks_as_invalid_are_counted(tmp_path: Path, quick_mdf: None) -> None:
+    t, invalid = np.arange(40) / 10.0, np.arange(40) % 7 == 3
+    with asammdf.MDF(version="4.10") as mdf:
+        mdf.append([asammdf.Signal(50.0 + t, t, name="n_dem", invalidation_bits=invalid)])
+        mdf.save(tmp_path / "a.mf4", overwrite=True)
+    log = read_log(tmp_path / "a.mf4")
+    assert log.channels["n_dem"].t.tolist() == t[~invalid].tolist()
+    (done,) = counted(log.notes)
+    assert (done["kind"], done["of"], done["count"]) == ("left out", "n_dem", int(invalid.sum()))
+
+
 def read_log_text(folder: Path, text: str) -> Log:
     (folder / "a.csv").write_text(text)
     return read_log(folder / "a.csv", require=("n_dem",))

@@ -24,13 +24,17 @@ from vaneloop.base.signals import UNITS
 
 __all__ = ["open_csv", "open_text", "write_csv", "write_lvm", "write_msl"]
 
-_NO_SAMPLE = ["NA", "N/A", "null", "None", "-"]
+_NO_SAMPLE = ["NA", "N/A", "n/a", "#N/A", "#NA", "<NA>", "NaT", "null", "NULL", "(null)", "None", "-", "--", "---"]
+# what C and table programs print for a number that is none
+_NO_NUMBER = {f"{sign}1.#{word}" for sign in ("", "-") for word in ("IND", "QNAN", "SNAN", "INF")} | {
+    "#DIV/0!", "#VALUE!", "#NUM!", "#REF!", "#NAME?", "#NULL!",
+}  # fmt: skip
 _BLOCK = 1 << 23  # bytes read at once; no row may be longer
 _INK = re.compile(rb"\S")
 _WORD = re.compile(rb"[b-dg-hj-mo-zB-DG-HJ-MO-Z_]")  # of a word, and neither of a number, nan nor inf
 _END = "\x1e\x1a"  # stands behind the last row, where none can be
 # a day, and the midnight that table programs put behind it
-_DAY = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}(?:[ T]0?0:00(?::00(?:[.,]0+)?)?)?")
+_DAY = re.compile(r"(?:\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}|\d{1,2}-[A-Za-zä]{3,9}-\d{4})(?:[ T]0?0:00(?::00(?:[.,]0+)?)?)?")
 _CLOCK = re.compile(r"\d{1,2}:\d{2}.*")
 _NUMBERED = re.compile(r"[._ ]\d+$")
 
@@ -44,7 +48,8 @@ def open_text(path: Path, raw: bytes, options: Options) -> Source:
     """The table that ``raw`` is the text of."""
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raw = raw.decode("utf-16", errors="replace").encode()
-    if b"\0" in raw:
+    cut = len(raw) - len(raw := raw.rstrip(b"\0"))  # space that a logger had taken before its power went
+    if b"\0" in raw or not raw:
         raise LogError(f"{path}: is not a CSV (binary bytes in it)")
     if not raw.isascii():
         try:
@@ -72,6 +77,8 @@ def open_text(path: Path, raw: bytes, options: Options) -> Source:
     units = {**{k: split_unit(h)[1] for k, h in zip(keys, headers, strict=True) if k != h}, **layout.units}
     table = Table(offered, rows.column, layout.first, time, units, own=own, parts=parts, part=options.part)
     rows.notes = table.notes
+    if cut:
+        table.notes.append(f"rows: behind the last one stand {cut:,} bytes of 0, as after a loss of power: left out")
     return table
 
 
@@ -283,7 +290,7 @@ class _Csv:
             try:
                 if "_" in cell:  # Python's own spelling of thousands
                     raise ValueError
-                values[row] = float(cell)
+                values[row] = np.nan if cell in _NO_NUMBER else float(cell)
             except ValueError:
                 if key in self.times and (t := self._dates(key, text)) is not None:
                     return t

@@ -16,14 +16,21 @@ __all__ = ["Dates", "OddRow", "date_notes", "from_dates"]
 
 # days as loggers write them, and the clock; a decimal comma has become a point, Z has become +00:00
 _Y, _M, _D, _SHORT = r"(?P<y>\d{4})", r"(?P<m>\d{1,2})", r"(?P<d>\d{1,2})", r"(?P<y>\d{2})"
+_MONTHS = {
+    name: k
+    for k, names in enumerate(("jan", "feb", "mar mär mrz", "apr", "may mai", "jun", "jul", "aug", "sep", "oct okt",
+                               "nov", "dec dez"), 1)
+    for name in names.split()
+}  # fmt: skip
+_WORD = r"(?P<w>[A-Za-zä]{3})[a-zä]*\.?"  # a month's name
 _AMBIGUOUS = (
     f"{_D}/{_M}/{_Y}", f"{_M}/{_D}/{_Y}", f"{_D}/{_M}/{_SHORT}", f"{_M}/{_D}/{_SHORT}", f"{_SHORT}/{_M}/{_D}",
 )  # fmt: skip
 _DAYS = (
     f"{_Y}-{_M}-{_D}", f"{_Y}/{_M}/{_D}", rf"{_D}\.{_M}\.{_Y}", rf"{_D}\.{_M}\.{_SHORT}", *_AMBIGUOUS,
-    r"(?P<y>\d{4})(?P<m>\d{2})(?P<d>\d{2})",
+    r"(?P<y>\d{4})(?P<m>\d{2})(?P<d>\d{2})", f"{_D}[- .]+{_WORD}[- ]+{_Y}", f"{_WORD} +{_D}, *{_Y}",
 )  # fmt: skip
-_CLOCK = r"(?P<H>\d{1,2}):(?P<M>\d{2})(?::(?P<S>\d{2})(?P<f>\.\d+)?)?"
+_CLOCK = r"(?P<H>\d{1,2}):(?P<M>\d{2})(?::(?P<S>\d{2})(?P<f>\.\d+)?)?(?: *(?P<h>[AaPp])\.?[Mm]\.?)?"
 _ZONE = r"(?: *(?P<zh>[+-]\d{2}):?(?P<zm>\d{2}))?"
 _FEW = 1000  # rows that most forms of another kind are told by
 _HOUR, _DAY = 3_600_000_000, 86_400_000_000  # microseconds
@@ -65,7 +72,7 @@ def from_dates(text: Any) -> Dates | OddRow | None:
     known = np.asarray([v is not None for v in text.to_pylist()], bool)
     cells = text.drop_null()
     there = pc.replace_substring_regex(pc.utf8_trim_whitespace(cells), r"(\d),(\d+)", r"\1.\2")
-    there = pc.replace_substring_regex(there, r"(?i)\s*Z$", "+00:00")
+    there = pc.replace_substring_regex(there, r"(?i)\s*(?:Z|UTC|GMT)$", "+00:00")
     if not len(there) or not re.search(r"\d[:T]\d|\d [\d:]", str(there[0])):
         return None
     read, furthest = {}, 0
@@ -135,7 +142,11 @@ def _parsed(text: Any, form: str) -> np.ndarray | int:
         return numbers(cells.cast(pa.float64())).astype(np.int64)
 
     year, month, day = whole("y", 1970), whole("m", 1), whole("d", 1)
+    if parts.type.get_field_index("w") >= 0:
+        month = np.array([_MONTHS.get(w.lower(), 0) for w in pc.struct_field(parts, "w").to_pylist()])
     hour, minute, second = whole("H"), whole("M"), whole("S")
+    half = pc.utf8_lower(pc.struct_field(parts, "h"))  # of the day: a, p or none
+    halved = bool(pc.any(pc.not_equal(half, "")).as_py())
     east = whole("zh", _NO_ZONE)
     zoned = east != _NO_ZONE
     year += np.where(year < 69, 2000, np.where(year < 100, 1900, 0))
@@ -143,8 +154,12 @@ def _parsed(text: Any, form: str) -> np.ndarray | int:
     date = begins.astype("M8[D]") + (day - 1)
     wrong = (month < 1) | (month > 12) | (date.astype("M8[M]") != begins) | (hour > 23) | (minute > 59) | (second > 60)
     wrong |= zoned != zoned[0]
+    if halved:
+        wrong |= pc.equal(half, "").to_numpy(zero_copy_only=False) | (hour < 1) | (hour > 12)
     if wrong.any():
         return int(np.argmax(wrong))
+    if halved:
+        hour = hour % 12 + 12 * pc.equal(half, "p").to_numpy(zero_copy_only=False)
     if zoned.any():  # the sign is that of hours and minutes
         signs = np.where([str(z).startswith("-") for z in pc.struct_field(parts, "zh").to_pylist()], -1, 1)
         hour, minute = hour - east, minute - signs * whole("zm")

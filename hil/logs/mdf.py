@@ -22,6 +22,7 @@ import numpy as np
 
 from hil.logs.bus_log import open_bus_log
 from hil.logs.frames import Frames, in_order
+from hil.logs.notes import Note
 from hil.logs.record_formats import FramesOfRecord
 from hil.logs.source import LogError, Options, Samples, Series, Source, check_file, find, read_bytes
 from vaneloop.base.child import python
@@ -42,10 +43,13 @@ class Groups(Samples):
         super().__init__({key: Series(t, values, unit, framed=framed) for key, (t, values, unit, framed) in held})
         self.names = {key: tuple(names) for key, names in content["names"].items()}
         self.comments: dict[str, str] = content["comments"]
-        self._why = content["why"]
+        self._why, self._invalid = content["why"], content["invalid"]
 
     def series(self, key: str) -> Series:
         if key in self._series:
+            if lost := self._invalid.pop(key, 0):
+                said = f"{key}: {lost:,} samples that the logger marks as invalid: left out"
+                self.notes.append(Note(said, "left out", key, lost))
             return super().series(key)
         self.notes.append(f"{key}: {self._why.get(key, 'has no samples')}")
         return Series(np.empty(0), np.empty(0))
@@ -70,8 +74,8 @@ def read_mdf(path: Path, wanted: list[str], guess: bool = False) -> tuple[dict[s
 
     Returns a dict with "names" (key -> names it may be asked by), "series" (key -> t, values, unit, whether they came
     in frames of a bus) of the keys that answer to ``wanted`` (with ``guess``, of those too whose name or comment means
-    one of our signals), "comments" of these, "why" (key -> reason it has no numbers), and the frames of its bus
-    logging, if any.
+    one of our signals), "comments" of these, "why" (key -> reason it has no numbers), "invalid" (key -> how many
+    samples the logger marks as invalid, which are left out), and the frames of its bus logging, if any.
     """
     reply, arrays = _answered(path, {"wanted": wanted, "guess": guess})
     series = {
@@ -81,7 +85,7 @@ def read_mdf(path: Path, wanted: list[str], guess: bool = False) -> tuple[dict[s
     for i in range(reply["buses"]):
         t, ident, bus, length, data = (arrays[f"b{i}.{k}"] for k in range(5))
         parts.append((*in_order(str(path), t, notes := []), ident, bus, length, data, notes))  # type: ignore[var-annotated]
-    return {**{k: reply[k] for k in ("names", "comments", "why")}, "series": series}, _merge(parts)
+    return {**{k: reply[k] for k in ("names", "comments", "why", "invalid")}, "series": series}, _merge(parts)
 
 
 def read_as_others(path: Path, request: dict[str, Any]) -> dict[str, np.ndarray]:

@@ -99,7 +99,7 @@ def _read(mdf: Any, wanted: list[str], guess: bool, arrays: dict[str, np.ndarray
                 arrays[f"b{buses}.{k}"] = a
             buses += 1
     found = _found(mdf)
-    reply: dict[str, Any] = {"names": {}, "series": {}, "comments": {}, "why": {}, "buses": buses}
+    reply: dict[str, Any] = {"names": {}, "series": {}, "comments": {}, "why": {}, "invalid": {}, "buses": buses}
     fold = {w.casefold() for w in wanted}
     for n, (key, g, i, name, label, master) in enumerate(found):
         short = name.split("\\")[0]
@@ -122,6 +122,7 @@ def _read(mdf: Any, wanted: list[str], guess: bool, arrays: dict[str, np.ndarray
         source = mdf.groups[g].channels[i].source or getattr(mdf.groups[g].channel_group, "acq_source", None)
         framed = getattr(source, "source_type", None) == SOURCE_BUS
         reply["series"][key] = (n, str(s.unit or "")[:40], framed)
+        reply["invalid"][key] = max(int(mdf.groups[g].channel_group.cycles_nr) - len(s.samples), 0)
         arrays[f"t{n}"], arrays[f"v{n}"] = s.timestamps.astype(np.float64), s.samples.astype(np.float64)
     return reply
 

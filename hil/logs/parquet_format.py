@@ -61,7 +61,8 @@ def open_parquet(path: Path, options: Options) -> Source:
     schema = file.schema_arrow
     if again := second(schema.names):
         raise LogError(f"{path}: column {again!r} is there more than once")
-    time = time_column(path, list(schema.names), options)
+    dates_of = [name for name, kind in zip(schema.names, schema.types, strict=True) if pa.types.is_timestamp(kind)]
+    time = time_column(path, list(schema.names), options, dates_of)
 
     def load(key: str) -> np.ndarray:
         kind = schema.field(key).type

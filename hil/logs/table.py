@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from hil.logs.names import is_time
+from hil.logs.names import CERTAIN, is_time
 from hil.logs.notes import Note
 from hil.logs.source import LogError, Options, Series, close_names, names_held
 from hil.logs.times import guess_column
@@ -133,9 +133,9 @@ class Time(NamedTuple):
     sure: float = 0.0
 
 
-def time_column(path: Path, headers: list[str], options: Options) -> Time:
+def time_column(path: Path, headers: list[str], options: Options, dates: Sequence[str] = ()) -> Time:
     """The column of a table that holds the time: mapped to t, called t, or called like it; else one that says time in
-    other words, if guesses are wanted.
+    other words, or the only one of ``dates``, whose type says that they hold dates, if guesses are wanted.
     """
     asked = next((name for name, signal in options.mapping.items() if signal == "t"), None)
     called = [(h, h.strip(), split_unit(h)[0]) for h in headers]
@@ -158,6 +158,9 @@ def time_column(path: Path, headers: list[str], options: Options) -> Time:
         )
         note += "none"
         return Time(found[0], unit, (note,), sure)
+    if not found and options.guess and len(dates) == 1:
+        note = f"t: guessed to be {dates[0]!r}, the only column of dates; --map NAME=t takes another, --no-guess none"
+        return Time(dates[0], "", (note,), CERTAIN)
     if found:
         raise NoTime(f"{path}: the time may be {' or '.join(map(repr, found[:4]))}: --map NAME=t takes one", headers)
     if options.rows:
