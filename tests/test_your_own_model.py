@@ -505,6 +505,27 @@ def test_a_law_that_harms_a_test_log_is_not_named() -> None:
     assert any("is not named: makes other worse" in n for n in answer.diagnosis.notes)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 3])
+def test_two_places_that_say_the_same_leave_room_for_what_is_beside(seed: int) -> None:
+    """Play and an offset, of which neither alone helps in three quarters of the log: at the input or at the output they
+    are the same.
+    """
+    rng = np.random.default_rng(seed)
+    t = np.arange(1200) * 0.02
+    u = np.cumsum(np.interp(t, np.arange(0.0, 30.0, 1.5), rng.uniform(-1.5, 1.5, 20))) * 0.02
+    y, z = np.empty_like(u), 0.0
+    for k, x in enumerate(u):
+        z = y[k] = min(max(z, x - 0.011), x + 0.011)
+    ratio = unknown("ratio", 1.0, "-", low=0.5, high=2.0)
+    gear = System(
+        "gear", "static", lambda u, p: p.ratio * u.u, inputs={"u": "rad"}, outputs={"y": "rad"}, parameters=[ratio]
+    )
+    answer = diagnose([Record("gear", t, {"u": u, "y": y - 0.016 + 1e-5 * rng.standard_normal(t.size)})], gear)
+    assert answer.verdict == "missing"
+    assert {e.partition(".")[2] for e in named(answer)} == {"bias", "play"}
+
+
 @pytest.mark.parametrize("samples", [4, 5, 300])
 def test_rates_of_a_spline_are_scipy_s(samples: int) -> None:
     """On any raster, of one signal or of many."""

@@ -225,6 +225,9 @@ class EffectSelection:
         if not criterion.roams and alone and _least(search, tried) > TOLERATED:
             (first,) = min(alone, key=criterion.order).effects
             tried += search.best_of([(first, m) for m in names if m != first])
+        if criterion.roams and not alone and leaders:
+            # the leader may need one that does nothing alone, and those that do the same elsewhere are leaders, too
+            options += search.best_of([(leaders[0], m) for m in names if m != leaders[0]])
         if tried and not (criterion.roams and alone) and _least(search, tried) > TOLERATED:
             options += search.best_of(list(itertools.combinations(leaders, 2)))
         return options
