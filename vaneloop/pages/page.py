@@ -121,7 +121,7 @@ class Page:
             self.section("Notes")
             for note in notes:
                 if not isinstance(note, Note):
-                    self.text(f"{capital(note)}.")
+                    self.text(f"{capital(note).removesuffix('.')}.")
             self.done(counted(notes))
 
     def done(self, done: Sequence[Mapping[str, Any]]) -> None:
