@@ -14,6 +14,7 @@ others           what python-can, cantools and asammdf find in a log
 opening          which name of a log is which signal: stated, in a mapping file (mapping), or guessed
 names, guess, times
                  what a name says; which guess is made; the time of a table
+formula          channels made of channels
 survey           all of that shown before anybody reads the log
 held             what a controller had received: a value in a frame holds from that frame on
 units, plausible which unit a number is in, and whether it can be

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeVar, overload
 import numpy as np
 
 from hil.logs.errors import LogError
+from hil.logs.formula import formula_of
 from vaneloop.base.errors import meant
 from vaneloop.base.extras import needed
 from vaneloop.base.notebook import html_table
@@ -135,6 +136,7 @@ class Channels:
     ``for name in log``             each name
     ``log.units``                   unit of each name
     ``log.to_pandas()``             a ``pandas.DataFrame``
+    ``log.assign(lag="a - b")``     with a channel more, made by a formula
     ==============================  ====================================================
 
     Nothing is changed in place, so threads may share one.
@@ -227,6 +229,40 @@ class Channels:
             there = f"the log is from {t[0]:g} to {t[-1]:g} s" if len(t) else "the log has none at all"
             raise LogError(f"{self.path}: no sample in '{' '.join(map(str, spans))}'; {there}")
         return replace(self, channels=channels)
+
+    def assign(self: Self, **made: str | Channel) -> Self:
+        """The same with channels that formulas make, or that are given; a name that is there is replaced.
+
+        Parameters
+        ----------
+        **made : str or Channel
+            Name -> formula of channels, such as ``"x_dem - x_lvdt [um]"`` (docs/logs.md#formulas), or a channel. A
+            later formula may name an earlier one.
+
+        Raises
+        ------
+        LogError
+            One line with the position of what is wrong in a formula.
+
+        Examples
+        --------
+        >>> import vaneloop
+        >>> log = vaneloop.read_log("examples/hidden_effect.parquet")
+        >>> log.assign(lag="x_dem - x_lvdt [um]")["lag"]
+        Channel(20,000 samples, 0 to 199.99 s, -224 to 204 um)
+        """
+        channels = dict(self.channels)
+        for name, given in made.items():
+            if isinstance(given, Channel):
+                channels[name] = given
+                continue
+            t, values, unit = formula_of(given).made(channels, self._unit_of(name))
+            channels[name] = Channel(t, values, unit=unit)
+        return replace(self, channels=channels)
+
+    def _unit_of(self, name: str) -> str:
+        """The unit that a channel of that name must have; "": any."""
+        return ""
 
     def to_pandas(self) -> DataFrame:
         """All channels as a ``pandas.DataFrame``, which every analysis takes as it takes a log.

@@ -20,7 +20,6 @@ from hil.logs.plausible import FEW, RUN
 from hil.logs.source import ABSENT, Channel, LogError, Options, Source, is_absent, numbers, read_bytes
 from hil.logs.table import ROW, Table, Time, split_unit, time_column
 from vaneloop.base.files import whole
-from vaneloop.base.signals import UNITS
 
 __all__ = ["open_csv", "open_text", "write_csv", "write_lvm", "write_msl"]
 
@@ -62,7 +61,7 @@ def open_text(path: Path, raw: bytes, options: Options) -> Source:
     labview = layout.labview and "X_Value" in headers and "t" not in options.mapping.values()
     time = Time("X_Value") if labview else time_column(path, headers, options)
     own = _own_times(layout, time.name)
-    known = {*UNITS, *options.mapping}
+    known = {*options.signals, *options.mapping}
     for h in dict.fromkeys(headers):
         if h and headers.count(h) > 1 and h not in own.values() and ({h, split_unit(h)[0]} & known or h == time.name):
             others = [k for k, of in zip(keys, headers, strict=True) if of == h][1:]
@@ -367,19 +366,19 @@ def write_csv(path: Path, channels: dict[str, Channel], dbc: Path | None) -> Non
 def write_msl(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
     """Write a log as TunerStudio does: two lines, names, units, rows, with tabs between."""
     table = arrow_table(channels)
-    names = table.column_names[1:]
-    units = "\t".join(["s", *(UNITS[name] for name in names)]) + "\n"
+    names = list(channels)
+    units = "\t".join(["s", *(c.unit for c in channels.values())]) + "\n"
     _write(path, table, "\t", '"VaneLoop"\n"Capture Date: "\n', ["Time", *names], units)
 
 
 def write_lvm(path: Path, channels: dict[str, Channel], dbc: Path | None) -> None:
     """Write a LabVIEW measurement file: one time for all channels, decimal point."""
     table = arrow_table(channels)
-    names = table.column_names[1:]
+    names = list(channels)
     about = {"Writer_Version": "2", "Reader_Version": "2", "Separator": "Tab", "Decimal_Separator": ".",
              "Multi_Headings": "No", "X_Columns": "One", "Time_Pref": "Relative"}  # fmt: skip
     block = {"Channels": [str(len(names))], "Samples": [str(table.num_rows)] * len(names),
-             "Y_Unit_Label": [UNITS[n] for n in names], "X_Dimension": ["Time"] * len(names)}  # fmt: skip
+             "Y_Unit_Label": [c.unit for c in channels.values()], "X_Dimension": ["Time"] * len(names)}  # fmt: skip
     head = "LabVIEW Measurement\t\n" + "".join(f"{k}\t{v}\n" for k, v in about.items()) + "***End_of_Header***\t\n\t\n"
     head += "".join("\t".join([k, *v]) + "\n" for k, v in block.items()) + "***End_of_Header***\t\n"
     _write(path, table, "\t", head, ["X_Value", *names])

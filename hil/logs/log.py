@@ -9,6 +9,7 @@ be left out is said in `Log.notes`. docs/logs.md is the user's page.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Channel", "Log", "LogError", "offered", "read_log", "write_log"]
 
+_A_NAME = re.compile(r"[^\W\d]\w*")
+_A_UNIT = re.compile(r"[^\t\r\n,;\"\[\]]{1,32}")
 _EPOCH = 1e8  # s; a table whose time starts three years in counts from 1970, not from the start of the log
 
 
@@ -92,6 +95,9 @@ class Log(Channels):
             raise LogError(f"{self.path}: {why}; --unit t={unit}, if time counts in {unit}")
         own = {name: c if c.unit else replace(c, unit=self.signals.get(name, "")) for name, c in self.channels.items()}
         object.__setattr__(self, "channels", own)
+
+    def _unit_of(self, name: str) -> str:
+        return self.signals.get(name, "")
 
     @classmethod
     def from_dataframe(
@@ -581,18 +587,22 @@ def _shift(channels: dict[str, Channel], notes: list[str], era: str) -> None:
 def write_log(path: str | Path, channels: dict[str, Channel], *, dbc: str | Path | None = None) -> None:
     """Write channels as a log; the suffix says the format.
 
-    Tables and MDF4 hold every sample as it is. CAN formats hold what the bus would carry: the frames of ``dbc``
-    (default tables/vgv.dbc) at their periods, in their resolution, with valid counter and CRC, from 0 s on. Raises
-    LogError for a name that is no signal, a channel that is not one, a value that its frame cannot hold.
+    Tables and MDF4 hold every sample as it is, of a channel of any name that says its unit ("-": none). CAN formats
+    hold what the bus would carry: the frames of ``dbc`` (default tables/vgv.dbc) at their periods, in their resolution,
+    with valid counter and CRC, from 0 s on. Raises LogError for a name that is no signal, a channel that is not one, a
+    value that its frame cannot hold.
     """
     path = Path(path)
     of = format_of(path)
+    table = of.channels is not None and dbc is None
     if not channels:
         raise LogError(f"{path}: no channel to write")
     checked = {}
     for name, c in channels.items():
-        if name not in UNITS:
-            raise LogError(f"{path}: {name!r} is not a signal{close_names(name, UNITS)}; allowed: {', '.join(UNITS)}")
+        if name not in UNITS and not (table and _A_NAME.fullmatch(name) and _A_UNIT.fullmatch(c.unit)):
+            also = ", or in a table any name of letters and digits with a unit" if table else ""
+            what = f"is not a signal{close_names(name, UNITS)}; allowed: {', '.join(UNITS)}{also}"
+            raise LogError(f"{path}: {name!r} {what}")
         t, values = np.asarray(c.t, np.float64), np.asarray(c.values, np.float64)
         if t.ndim != 1 or t.shape != values.shape or not t.size:
             raise LogError(
@@ -600,5 +610,5 @@ def write_log(path: str | Path, channels: dict[str, Channel], *, dbc: str | Path
             )
         if not (np.isfinite(t).all() and np.isfinite(values).all() and (np.diff(t) > 0).all()):
             raise LogError(f"{path}: {name}: samples must be finite and their times increasing")
-        checked[name] = Channel(t, values)
+        checked[name] = Channel(t, values, unit=UNITS.get(name, c.unit))
     of.write(path, checked, Path(dbc) if dbc is not None else None)

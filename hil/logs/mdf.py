@@ -27,7 +27,6 @@ from hil.logs.record_formats import FramesOfRecord
 from hil.logs.source import LogError, Options, Samples, Series, Source, check_file, find, read_bytes
 from vaneloop.base.child import python
 from vaneloop.base.extras import needs
-from vaneloop.base.signals import UNITS
 
 __all__ = ["Groups", "open_mdf", "read_as_others", "read_mdf", "read_record_mdf"]
 
@@ -59,7 +58,7 @@ def open_mdf(path: Path, options: Options) -> Source:
     """MDF: bus logging where the file holds CAN frames and a DBC is given or no channel has a name that is
     asked for.
     """
-    wanted = [*UNITS, *options.mapping]
+    wanted = [*options.signals, *options.mapping]
     content, frames = read_mdf(path, wanted, options.guess)
     groups = Groups(content)
     if frames is not None and (

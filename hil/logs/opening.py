@@ -120,7 +120,7 @@ def open_log(
     given = _pairs(path, mapping, signals)
     named = {**bench.names, **given}
     by_name = {name: signal for signal, name in named.items()}
-    options = Options(Path(dbc) if dbc is not None else None, by_name, guess, part, rows)
+    options = Options(Path(dbc) if dbc is not None else None, by_name, guess, part, rows, tuple(signals))
     source = (opened or format_at(path).open)(path, options)
     if part and not isinstance(source, Table):
         raise LogError(f"{path}: part {part}: only tables have parts")

@@ -7,7 +7,7 @@ A source says what stands in the file. `hil.logs.log` brings it to the product's
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,6 +16,7 @@ import numpy as np
 
 from hil.logs.channels import Channel
 from hil.logs.errors import LogError
+from vaneloop.base.signals import UNITS
 
 __all__ = [
     "ABSENT", "Channel", "LogError", "Options", "Samples", "Series", "Source", "check_file", "close_names", "find",
@@ -85,6 +86,7 @@ class Options:
     guess: bool = False  # the time may have a name that says it in other words
     part: int = 0  # which run of a file that holds several, from 1; 0: the reader's choice
     rows: bool = False  # a table may have no time: its rows stand in no order
+    signals: Collection[str] = tuple(UNITS)  # names that are looked for, beside those mapped
 
 
 # A cell without a sample is this NaN; a NaN that the logger wrote is any other. Only the latter is reported.

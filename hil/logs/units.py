@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from hil.logs.errors import LogError
 from hil.logs.notes import Note
-from hil.logs.source import LogError
 from vaneloop.base.signals import UNITS
 
 __all__ = ["NO_UNIT", "USUAL_UNITS", "UnitError", "Units", "factor_of", "registry", "scale_of"]

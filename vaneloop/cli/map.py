@@ -6,11 +6,14 @@ import argparse
 from collections.abc import Mapping
 from pathlib import Path
 
+from hil.logs import read_log, write_log
+from hil.logs.formula import named
 from hil.logs.mapping import write_mapping
 from hil.logs.survey import sparkline, survey
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.base.signals import UNITS
+from vaneloop.base.spans import span_of
 from vaneloop.cli import options
 from vaneloop.identification import load_system
 from vaneloop.verbs.parts import signals_of
@@ -19,13 +22,15 @@ __all__ = ["DESCRIPTION", "add_options", "command"]
 
 DESCRIPTION = """Show what is in a log: the name and unit of each signal, stated or guessed, how surely, and how it
 looks. Every command that takes the log guesses the same (docs/logs.md). A mapping file keeps what is right: edit it,
-and give it to any command with --mapping.
+and give it to any command with --mapping. Formulas make channels of channels; what is read and made is written as a
+log.
 
 examples:
   vaneloop map examples/hidden_effect.parquet
   vaneloop map BENCH.csv --design-rpm 38000 --out bench.toml
   vaneloop replay BENCH.csv --mapping bench.toml
   vaneloop map examples/tank.csv --system examples/tank.py
+  vaneloop map examples/hidden_effect.parquet --formula "lag = x_dem - x_lvdt [um]" --between 10:20 --export lag.csv
   vaneloop map --check examples/engine_run.blf   # the same in python-can, cantools, asammdf?
 
 exit codes: 0 the log can be read so, 1 a line says what is missing or another reader finds something else, 2 bad
@@ -39,6 +44,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--system", metavar="MY.py", help="Python file with a vaneloop.System in it, whose channels are looked for"
     )
+    group = parser.add_argument_group("channels of channels (docs/logs.md#formulas)")
+    group.add_argument(
+        "--formula", metavar="'NAME = FORMULA [UNIT]'", action="append", default=[],
+        help="make a channel, such as 'lag = x_dem - x_lvdt [um]'; a later formula may name it",
+    )  # fmt: skip
+    group.add_argument(
+        "--between", metavar="FROM:TO", help="seconds of the log that --export writes, such as 10:20 (default: all)"
+    )
+    group.add_argument(
+        "--export", metavar="F",
+        help="write the channels that were read and made as a log (.csv, .parquet, .mf4, and without formulas any "
+             "format)",
+    )  # fmt: skip
     terminal.add_output_options(parser)
     parser.add_argument("--out", metavar="F.toml", help="write the mapping file")
     parser.add_argument(
@@ -50,7 +68,16 @@ def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     reading = options.log_options(args)
     options.warm_up_for(args)
-    seen = survey(args.log, **reading, signals=_signals(args.system))
+    signals = _signals(args.system)
+    formulas = [named(text) for text in args.formula]
+    span = span_of(args.between, "--between") if args.between else None
+    if span is not None and not args.export:
+        raise InputError(f"--between {args.between} needs --export F, the file that holds these seconds")
+    seen = survey(args.log, **reading, signals=signals)
+    log = None
+    if (formulas or args.export) and not seen.complaint:
+        log = read_log(args.log, **reading, require=(), signals=signals)
+        log = log.assign(**{f.name: f.text for f in formulas})
     rows = [
         [
             r.signal, r.name, r.unit, f"{100 * r.confidence:.0f} %" if r.how == "guessed" else r.how,
@@ -58,8 +85,14 @@ def command(args: argparse.Namespace) -> int:
         ]
         for r in seen.rows
     ]  # fmt: skip
+    if log is not None:
+        for f in formulas:
+            c = log[f.name]
+            low, high = float(c.values.min()), float(c.values.max())
+            unit = "" if c.unit == "-" else c.unit
+            rows.append([f.name, f.expression, unit, "formula", f"{low:.4g} to {high:.4g}", sparkline(c.values)])
     terminal.print_table(
-        args, f"{args.log}: names known: {len(rows)}, not known: {len(seen.other)}",
+        args, f"{args.log}: names known: {len(seen.rows)}, not known: {len(seen.other)}",
         ["signal", "in the log", "unit", "sure", "range", "over time"], rows,
     )  # fmt: skip
     for signal, why in seen.open.items():
@@ -83,7 +116,19 @@ def command(args: argparse.Namespace) -> int:
             args, f"{args.log}: read by VaneLoop, and by others", ["what", "VaneLoop", "another", "by", "same"],
             [[c.what, c.ours, c.theirs, c.by, words[c.same]] for c in found],
         )  # fmt: skip
+    if log is not None and formulas:
+        data["formulas"] = [
+            {
+                "name": f.name, "formula": f.expression, "unit": log[f.name].unit, "samples": len(log[f.name]),
+                "low": float(log[f.name].values.min()), "high": float(log[f.name].values.max()),
+            }
+            for f in formulas
+        ]  # fmt: skip
     terminal.write_json(args, data)
+    if log is not None and args.export:
+        part = log if span is None else log.within([span])
+        write_log(args.export, part.channels)
+        terminal.say(args, f"channels: {args.export}")
     if args.out:
         head = f"How VaneLoop reads the logs of this bench (--mapping). From {Path(args.log).name}."
         remarks = {r.signal: f"guessed, {100 * r.confidence:.0f} % sure" for r in seen.rows if r.how == "guessed"}

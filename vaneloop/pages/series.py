@@ -9,25 +9,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vaneloop.base.holes import holes
+
 __all__ = ["MAX_POINTS", "break_at_holes", "decimate", "distribution", "packed", "thin_path"]
 
 Array = NDArray[np.float64]
 MAX_POINTS = 4500  # points a line, three times the pixels of a wide plot; 48 kB of the file
-GAP = 10.0  # a hole in the samples this many times the usual distance breaks the line
 
 
 def break_at_holes(x: Array, y: Array) -> tuple[Array, Array]:
-    """Insert a NaN where the samples pause: where ``x`` leaps by more than 10 times the usual distance."""
-    if x.size < 3:
+    """Insert a NaN where the samples pause (`vaneloop.base.holes`)."""
+    at = holes(x)
+    if at.size == 0:
         return x, y
-    step = np.diff(x)
-    usual = float(np.median(step))
-    if usual <= 0:  # not a time axis
-        return x, y
-    holes = np.flatnonzero(step > GAP * usual)
-    if holes.size == 0 or holes.size > x.size // 20:  # many holes: an irregular raster, not a broken one
-        return x, y
-    return np.insert(x, holes + 1, x[holes] + usual), np.insert(y, holes + 1, np.nan)
+    return np.insert(x, at + 1, x[at] + float(np.median(np.diff(x)))), np.insert(y, at + 1, np.nan)
 
 
 def distribution(values: ArrayLike) -> tuple[Array, Array]:
