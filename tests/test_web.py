@@ -26,6 +26,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import vaneloop
 from hil.logs.notes import counted
 from hil.logs.survey import survey
 from tests.browser import AXE, CHROMIUM, LONG, WHY_NOT, driver, look_at, shot, violations
@@ -887,6 +888,127 @@ def test_curves_of_several_logs_with_their_events_layouts_and_exports(server: Se
     heights = re.findall(r'y="[\d.]+" text-anchor="end">(-?[\d.,]+)<', drawn)
     assert len(heights) >= 2 * page.evaluate("document.querySelectorAll('.curves .uplot').length")
     looks(page, "curves")
+
+
+def pick(page: Any, field: str, name: str) -> None:
+    """Choose an option of a field by keyboard."""
+    tab_to(page, f"{field} input")
+    page.keyboard.press("Enter")
+    page.get_by_role("option", name=name, exact=True).last.wait_for()
+    options = page.locator(".q-menu").last.get_by_role("option").all_inner_texts()
+    page.keyboard.press("Home")
+    for _ in range(len(options)):
+        if page.locator(".q-manual-focusable--focused").last.inner_text() == name:
+            break
+        page.keyboard.press("ArrowDown")
+    page.keyboard.press("Enter")
+    page.locator(".q-menu").wait_for(state="detached")
+
+
+@pytest.mark.slow
+@needs_browser
+def test_channels_of_channels_one_over_the_other_and_what_is_between_the_cursors(server: Server, page: Any) -> None:
+    """By keyboard alone; the file has the samples of the log, not the points drawn."""
+    page.goto(server.url)
+    choose(page, "renamed.csv")
+    page.get_by_role("button", name="Use 38000 rpm").click()
+    page.get_by_text("All channels").click()
+    page.wait_for_function("document.querySelector('.curves').dataset.points > 0")
+    field = ".formula input"
+    tab_to(page, field)
+    page.keyboard.type("lag = x_dem - x_lvt [um]")
+    page.keyboard.press("Enter")
+    page.get_by_role("alert").filter(has_text="position 15: no channel 'x_lvt' (did you mean x_lvdt?)").wait_for()
+    for text in ("lag = x_dem - x_lvdt [um]", "v = rate(x_lvdt)"):
+        page.keyboard.press("Control+A")
+        page.keyboard.type(text)
+        page.keyboard.press("Enter")
+        page.wait_for_function("document.querySelector('.formula input').value === ''")
+    page.get_by_text("lag [um] = x_dem - x_lvdt, 3,000 samples").wait_for()
+    page.get_by_text("v [mm/s] = rate(x_lvdt), 3,000 samples").wait_for()
+    assert not page.get_by_role("alert").filter(has_text="formula").count()
+    page.get_by_text("Channels: 7 of 7 shown").wait_for()
+
+    for k, text in ((1, "10"), (2, "99"), (2, "20")):
+        page.get_by_label(f"cursor {k} [s]").fill(text)
+        page.keyboard.press("Enter")
+        if text == "99":
+            page.get_by_text("cursor 2 (=99) must be a time of the log, 0 to 29.99 s").wait_for()
+    page.get_by_text("10 s apart").wait_for()
+    for which, name in (("x", "x_dem"), ("y", "lag"), ("colour", "v")):
+        pick(page, f".xy-{which}", name)
+    page.get_by_text("lag [um] over x_dem [mm], from 10 to 20 s: 1,000 samples. Coloured by v [mm/s]").wait_for()
+    page.locator(".xy .colorbar, .xy .cbaxis").first.wait_for()
+    points = page.evaluate("document.querySelector('.xy .js-plotly-plot').data[1].customdata")
+    assert min(points) == 10.0 and max(points) == 19.99
+    looks(page, "formulas")
+
+    tab_to(page, "[aria-label='save the channels as CSV']")
+    page.keyboard.press("Enter")
+    with page.expect_download() as download:
+        page.get_by_text("download between.csv").click()
+    head, *rows = Path(download.value.path()).read_text().splitlines()
+    names = head.split(",")
+    assert names[-2:] == ["lag [um]", "v [mm/s]"] and len(rows) == 1000
+    values = np.array([[float(v) for v in row.split(",")] for row in rows])
+    of = dict(zip(names, values.T, strict=True))
+    assert np.allclose(of["lag [um]"], 1e3 * (of["x_dem"] - of["x_lvdt"]), atol=1e-6) and of["t"][0] == 10.0
+    said = page.locator(".formulas .cmd code").inner_text()
+    assert "--formula 'lag = x_dem - x_lvdt [um]'" in said and said.endswith("--between 10:20 --export between.csv")
+
+    # a layout keeps both cursors; a formula stays with another log, and says why it makes nothing of that
+    page.get_by_label("name of a layout").fill("two")
+    page.keyboard.press("Enter")
+    tab_to(page, ".curves-stack")
+    for key in ("Home", "ArrowRight", "Shift+Enter", "Enter"):
+        page.keyboard.press(key)
+    page.wait_for_function(
+        "!document.querySelector('.curves-apart') || document.querySelector('.curves-apart').innerText !== '10 s apart'"
+    )
+    page.get_by_label("show a layout that was kept").select_option("two")
+    page.get_by_text("10 s apart").wait_for()
+    choose(page, "faulted.csv")
+    page.get_by_text("position 7: no channel 'x_dem'").wait_for()
+    page.get_by_text("v [mm/s] = rate(x_lvdt), 3,000 samples").wait_for()
+    assert page.get_by_label("cursor 1 [s]").input_value() == ""
+    page.get_by_role("button", name="take lag away").click()
+    page.get_by_text("position 7: no channel 'x_dem'").wait_for(state="detached")
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_channel_over_another_keeps_every_extreme_its_time_and_its_way(seed: int) -> None:
+    from vaneloop.web.xy import ARROWS, MOST, plane, xy_figure
+
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 30_000))
+    t = np.cumsum(rng.uniform(0.005, 0.015, n))
+    angle = rng.uniform(1.0, 5.0) * t / t[-1]
+    a, b = (vaneloop.Channel(t, 5.0 * f(angle) + 0.01 * rng.standard_normal(n), unit="mm") for f in (np.cos, np.sin))
+    span = (float(t[n // 4]), float(t[-1]))
+    p = plane(a, b, None, span)
+    inside = (t >= span[0]) & (t < span[1])
+    assert p.n == np.count_nonzero(inside) and len(p.t) <= MOST + 4
+    for drawn, c in ((p.x, a), (p.y, b)):
+        if inside.any():
+            assert (np.nanmin(drawn), np.nanmax(drawn)) == (c.values[inside].min(), c.values[inside].max())
+    assert np.isin(p.t, t).all() and np.array_equal(p.colour, p.t) and np.isin(p.x, a.values).all()
+    arrows = next(d for d in xy_figure(p, ["x", "y", "t"])["data"] if d.get("name") == "direction")
+    x, y = np.array(arrows["x"]).reshape(-1, 2), np.array(arrows["y"]).reshape(-1, 2)
+    assert len(x) <= ARROWS
+    if np.ptp(angle[inside] if inside.any() else angle[:1]) > 0.5:  # each arrow goes round as the run does
+        assert len(x) and (x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0] > 0.0).all()
+
+
+def test_a_hole_is_not_drawn_over_and_a_third_channel_colours() -> None:
+    from vaneloop.web.xy import plane
+
+    t = np.concatenate([np.arange(0, 500), np.arange(900, 1400)]) / 100.0
+    x, y = vaneloop.Channel(t, t, unit="s"), vaneloop.Channel(t, -t)
+    fine = vaneloop.Channel(np.arange(0, 14000) / 1000.0, np.arange(0, 14000) / 1000.0)
+    p = plane(x, y, fine)
+    assert p.n == 9982 and np.allclose(p.colour[np.isfinite(p.x)], p.x[np.isfinite(p.x)])
+    lines = plane(x, y, None)
+    assert np.isnan(lines.x).sum() == 1 and lines.t[np.isnan(lines.x)] == 4.99
 
 
 @needs_browser

@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import operator
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, NamedTuple, Protocol
@@ -27,7 +27,7 @@ from hil.logs.units import NO_UNIT, factor_of
 from vaneloop.base.errors import meant
 from vaneloop.base.holes import holes
 
-__all__ = ["FUNCTIONS", "OPERATORS", "Formula", "FormulaError", "Made", "formula_of", "named"]
+__all__ = ["FUNCTIONS", "OPERATORS", "Formula", "FormulaError", "Made", "aligned", "formula_of", "named"]
 
 Array = np.ndarray
 MOST = 400  # characters
@@ -480,6 +480,22 @@ class _Parser:
         return _Node(token.at, compute)
 
 
+def aligned(channels: Sequence[Sampled]) -> tuple[Array, list[Array]]:
+    """The finest raster of all channels, from where the last begins to where the first ends, and each on it.
+
+    NaN in a hole.
+    """
+    t, values = _together(*(_sampled_of(c) for c in channels))
+    assert t is not None
+    return t, values
+
+
+def _sampled_of(channel: Sampled) -> _Value:
+    values = np.asarray(channel.values, dtype=float)
+    whole = bool((values == np.rint(values)).all())
+    return _Value(values, _powers(channel.unit), np.asarray(channel.t, dtype=float), whole)
+
+
 # ---- the formula -----------------------------------------------------------------------------------------------------
 
 
@@ -512,11 +528,9 @@ class Formula:
             if name not in channels:
                 there = ", ".join(channels)
                 raise self._wrong(name, f"no channel {name!r}{meant(name, channels)}; the log has {there}")
-            c = channels[name]
-            if not len(c.t):
+            if not len(channels[name].t):
                 raise self._wrong(name, f"{name} has no sample")
-            v = np.asarray(c.values, dtype=float)
-            given[name] = _Value(v, _powers(c.unit), np.asarray(c.t, dtype=float), bool((v == np.rint(v)).all()))
+            given[name] = _sampled_of(channels[name])
         whole = all(x.unit for x in given.values())  # a result without a unit is then a ratio
         if "t" in self.names and "t" not in given:
             others = list(given.values()) or [_Value(c.values, NONE, c.t) for c in channels.values()]

@@ -19,6 +19,7 @@ from hil.logs.frames import Frames
 from hil.logs.record_formats import ERROR, FD, NOTE_CHANNEL, REMOTE, append_whole
 from hil.logs.source import Channel, LogError
 from vaneloop.base.files import whole
+from vaneloop.base.signals import UNITS
 
 __all__ = ["MdfRecord", "write_bus", "write_groups", "write_mdf", "write_mdf3"]
 
@@ -37,7 +38,7 @@ def _rasters(channels: dict[str, Channel]) -> list[tuple[np.ndarray, dict[str, t
     """Channels by their times: for each the times and name -> (values, unit)."""
     rasters: dict[bytes, tuple[np.ndarray, dict[str, tuple[np.ndarray, str]]]] = {}
     for name, c in channels.items():
-        rasters.setdefault(c.t.tobytes(), (c.t, {}))[1][name] = c.values, "" if c.unit == "-" else c.unit
+        rasters.setdefault(c.t.tobytes(), (c.t, {}))[1][name] = c.values, UNITS.get(name, c.unit).replace("-", "")
     return list(rasters.values())
 
 

@@ -13,17 +13,20 @@ export default {
       <button type="button" class="curves-tool" @click="keep" aria-label="keep this layout: view, channels, lines hidden, reference">Keep layout</button>
       <select v-if="Object.keys(kept).length" class="curves-tool" aria-label="show a layout that was kept" @change="recall($event.target.value)">
         <option value="" :selected="!shown">layouts kept</option><option v-for="(_, n) in kept" :key="n" :value="n" :selected="n === shown">{{ n }}</option></select>
-      <button v-if="kept[name]" type="button" class="curves-tool" @click="forget" :aria-label="'forget the layout ' + name">Forget</button></template></div>
+      <button v-if="kept[name]" type="button" class="curves-tool" @click="forget" :aria-label="'forget the layout ' + name">Forget</button>
+      <label v-for="k in 2" :key="k" class="curves-cursor">cursor {{ k }} [s] <input class="curves-find" inputmode="decimal" :value="typed[k - 1]" @change="type_(k, $event.target)" @keydown.enter="type_(k, $event.target)"></label>
+      <span v-if="apart" class="curves-apart">{{ apart }}</span></template></div>
+    <div v-if="wrong" class="complaint" role="alert">{{ wrong }}</div>
     <details v-if="tools && tree" class="curves-tree"><summary>Channels: {{ names.filter((c) => wanted(c)).length }} of {{ names.length }} shown</summary>
       <div class="curves-groups"><fieldset v-for="group in groups()" :key="group.name"><legend><label><input type="checkbox" :checked="group.list.every((c) => !off[c.title])"
         @change="show(group.list, $event.target.checked)"> {{ group.name }}</label></legend>
         <label v-for="c in group.list" :key="c.title"><input type="checkbox" :checked="!off[c.title]" @change="show([c], $event.target.checked)"> {{ c.title }}</label></fieldset></div></details>
     <div ref="legend" class="curves-legend"></div>
-    <div ref="stack" class="curves-stack" :tabindex="tools ? 0 : undefined" role="group" :aria-label="!tools ? 'curves' : 'curves; arrow keys move the cursor, plus and minus zoom, page keys pan, home shows everything, enter sets the reference'" @keydown="key_"></div>
+    <div ref="stack" class="curves-stack" :tabindex="tools ? 0 : undefined" role="group" :aria-label="!tools ? 'curves' : 'curves; arrow keys move the cursor, plus and minus zoom, page keys pan, home shows everything, enter sets the reference' + (tree ? ', shift and enter cursor 2' : '')" @keydown="key_"></div>
     <div ref="said" class="away" role="status"></div>
-    <div v-if="!live" ref="hint" class="curves-hint" style="display:none">drag: zoom &middot; wheel: zoom at the pointer &middot; shift + drag: pan &middot; click: reference for differences &middot; double-click: everything</div></div>`,
-  props: { src: String, version: Number, live: Number, unit: String, tree: Boolean },
-  data() { return { tools: false, word: "", name: "", shown: "", names: [], off: {}, kept: {} }; },
+    <div v-if="!live" ref="hint" class="curves-hint" style="display:none">drag: zoom &middot; wheel: zoom at the pointer &middot; shift + drag: pan &middot; click: reference for differences<template v-if="tree"> (cursor 1) &middot; alt + click: cursor 2</template> &middot; double-click: everything</div></div>`,
+  props: { src: String, version: Number, live: Number, unit: String, tree: Boolean, cursors: Array },
+  data() { return { tools: false, word: "", name: "", shown: "", names: [], off: {}, kept: {}, typed: ["", ""], apart: "", wrong: "" }; },
   mounted() {
     this.plots = [];
     this.view = null; // [from, to] in s; null: everything
@@ -31,7 +34,7 @@ export default {
     this.busy = false;
     this.again = false;
     this.hidden = {};
-    this.at = null; // s: reference cursor
+    [this.at, this.to] = this.cursors || [null, null]; // s: cursor 1, the reference, and cursor 2
     this.kept = JSON.parse(localStorage.getItem("layouts " + this.src) || "{}");
     this.sizes = new ResizeObserver(() => this.resize());
     this.sizes.observe(this.$el);
@@ -91,10 +94,11 @@ export default {
       if (JSON.stringify(names) !== JSON.stringify(this.names)) this.names = names;
       const shape = JSON.stringify([head.panels.map((p) => [p.title, p.unit, p.lines, p.height]), head.key]);
       if (shape !== this.shape) {
-        if (head.key !== this.key) { this.view = null; this.at = null; }
+        if (head.key !== this.key && this.key !== undefined) { this.view = null; this.at = this.to = null; }
         this.key = head.key;
         this.shape = shape;
         this.build();
+        this.told(false);
       } else {
         this.plots.forEach((p) => p.setData(data[p.panel], false));
         this.scale();
@@ -267,14 +271,19 @@ export default {
       c.save();
       const marks = (this.head.marks || []).map(([t, text]) => ({ x: u.valToPos(t, "x", true), text, role: "bad" })).filter((m) => inside(m.x));
       marks.forEach((m) => line(m.x, m.role));
-      if (this.at !== null && inside(u.valToPos(this.at, "x", true))) line(u.valToPos(this.at, "x", true), "text");
+      const cursors = [this.at, this.to].map((t, k) => ({ t, text: this.tree ? String(k + 1) : "", role: "text" })).filter((m) => m.t !== null).map((m) => ({ ...m, x: u.valToPos(m.t, "x", true) }));
+      cursors.filter((m) => inside(m.x)).forEach((m) => line(m.x, m.role));
+      if (cursors.length === 2) {
+        const [a, b] = cursors.map((m) => Math.min(right, Math.max(left, m.x))).sort((m, n) => m - n);
+        c.globalAlpha = 0.07; c.fillStyle = colour("text"); c.fillRect(a, top, b - a, height); c.globalAlpha = 1;
+      }
       if (named) {
         c.font = 11 * dots + "px system-ui, sans-serif";
         c.textAlign = "left";
         c.textBaseline = "alphabetic";
         const bands = (this.head.bands || []).map(([a, b, text]) => ({ x: Math.max(left, u.valToPos(a, "x", true)), end: u.valToPos(b, "x", true), text, role: "text" })).filter((m) => m.end > left && m.x < right);
         const words = (list) => this.placed(list, left, right, (t) => c.measureText(t).width, 4 * dots);
-        const above = words(marks), below = words(bands), rows = 12 * dots, head = this.own ? 16 * dots : 0;
+        const above = words([...marks, ...cursors.filter((m) => m.text && inside(m.x))]), below = words(bands), rows = 12 * dots, head = this.own ? 16 * dots : 0;
         const write = (m, y) => { // legible where a line passes
           c.globalAlpha = 0.75;
           c.fillStyle = colour("panel");
@@ -305,6 +314,7 @@ export default {
     moment(t) {
       // show a moment of a log with what is near it to each side; a live chart is held by the server
       this.at = t;
+      this.told();
       const near = this.head?.near ?? 2;
       if (!this.live) this.look(t - near, t + near);
       this.plots.forEach((p) => p.redraw(false));
@@ -317,15 +327,40 @@ export default {
       const step = (e.shiftKey ? 0.1 : 0.01) * w;
       const cursor = (t) => { u.setCursor({ left: u.valToPos(Math.min(b, Math.max(a, t)), "x"), top: 10 }, true, true); this.$refs.said.textContent = this.plots.map((p) => this.head.panels[p.panel].title + " " + p.readout.textContent).join("; "); };
       const acts = { ArrowLeft: () => cursor(at - step), ArrowRight: () => cursor(at + step), "+": () => this.look(at - w / 4, at + w / 4), "-": () => this.look(at - w, at + w),
-        PageUp: () => this.look(a - w / 2, b - w / 2), PageDown: () => this.look(a + w / 2, b + w / 2), Home: () => this.everything(), Enter: () => this.refer(at) };
+        PageUp: () => this.look(a - w / 2, b - w / 2), PageDown: () => this.look(a + w / 2, b + w / 2), Home: () => this.everything(), Enter: () => this.refer(at, this.tree && e.shiftKey) };
       if (!acts[e.key] || this.live) return;
       e.preventDefault();
       acts[e.key]();
     },
-    refer(t) {
+    refer(t, second) {
+      // set cursor 1, the reference, or cursor 2; where it stands already, it goes
+      const which = second ? "to" : "at";
       this.shown = "";
-      this.at = this.at !== null && Math.abs(this.at - t) < 1e-9 ? null : t;
+      this[which] = this[which] !== null && t !== null && Math.abs(this[which] - t) < 1e-9 ? null : t;
+      this.told();
       this.plots.forEach((p) => p.redraw(false));
+    },
+    told(out = true) {
+      // say where the cursors are: in the fields, and to the server
+      const said = (t) => (t === null ? "" : String(+t.toFixed(6)));
+      this.typed = [said(this.at), said(this.to)];
+      this.apart = this.at === null || this.to === null ? "" : `${+Math.abs(this.to - this.at).toPrecision(6)} s apart`;
+      this.wrong = "";
+      const now = JSON.stringify([this.at, this.to]);
+      if (out && this.tree && now !== this.sent) this.$emit("cursors", [this.at, this.to]);
+      this.sent = now;
+    },
+    type_(k, field) {
+      const text = field.value.trim().replace(",", "."), t = Number(text), [low, high] = this.head.span, before = k === 1 ? this.at : this.to;
+      if (text && !(t >= low && t <= high)) {
+        this.wrong = `cursor ${k} (=${field.value.trim()}) must be a time of the log, ${+low.toPrecision(9)} to ${+high.toPrecision(9)} s`;
+        return;
+      }
+      const next = text ? t : null;
+      if (next !== before) this.refer(next, k === 2);
+      else this.told(false);
+      const [a, b] = this.view || this.head.span;
+      if (next !== null && (next < a || next > b)) this.look(next - (b - a) / 2, next + (b - a) / 2);
     },
     save(name, href) { const a = document.createElement("a"); a.href = href; a.download = name; a.click(); },
     file(suffix) { return this.src.split("/").pop() + "." + suffix; },
@@ -388,7 +423,7 @@ export default {
         const [L, T, W, H] = [box.left, box.top, box.width, box.height].map((v) => v / dots);
         const spans = (this.head.bands || []).map(([a, b, , role]) => `<rect x="${X(a)}" y="${top + T}" width="${Math.max(1, x(b) - x(a)).toFixed(1)}" height="${H}" fill="${colour(role)}" fill-opacity="0.16"/>`).join("");
         const floor = panel.band ? `<rect x="${L}" y="${Y(panel.band)}" width="${W}" height="${(Y(-panel.band) - Y(panel.band)).toFixed(1)}" fill="${colour("noise")}" fill-opacity="0.2"/>` : "";
-        const upright = [...(this.head.marks || []).map(([t]) => [t, "bad"]), ...(this.at === null ? [] : [[this.at, "text"]])]
+        const upright = [...(this.head.marks || []).map(([t]) => [t, "bad"]), ...[this.at, this.to].filter((t) => t !== null).map((t) => [t, "text"])]
           .map(([t, role]) => `<path d="M${X(t)} ${top + T}L${X(t)} ${top + T + H}" stroke="${colour(role)}" stroke-dasharray="4 3"/>`).join("");
         const named = first ? "" : [[(this.head.marks || []).map(([t, text]) => ({ x: x(t), end: x(t), text, role: "bad" })), (m) => top + T + 12 * (m.row + 2)],
           [(this.head.bands || []).map(([a, b, text]) => ({ x: Math.max(L, x(a)), end: x(b), text, role: "text" })), (m) => top + T + H - 4 - 12 * m.row]]
@@ -410,7 +445,7 @@ export default {
     keep() {
       for (let k = 1; !this.name.trim(); k += 1) if (!this.kept["layout " + k]) this.name = "layout " + k;
       this.name = this.name.trim();
-      this.kept[this.name] = { view: this.view, word: this.word, hidden: { ...this.hidden }, off: { ...this.off }, at: this.at };
+      this.kept[this.name] = { view: this.view, word: this.word, hidden: { ...this.hidden }, off: { ...this.off }, at: this.at, to: this.to };
       this.shown = this.name;
       this.store();
     },
@@ -428,6 +463,8 @@ export default {
       this.off = { ...kept.off };
       this.view = kept.view;
       this.at = kept.at;
+      this.to = kept.to ?? null;
+      this.told();
       this.build();
       this.fetch();
     },
@@ -465,7 +502,7 @@ export default {
       }, true);
       let down = 0;
       over.addEventListener("pointerdown", (e) => { down = e.clientX; });
-      over.addEventListener("click", (e) => { if (!this.live && Math.abs(e.clientX - down) < 4 && e.detail === 1) this.refer(plot.posToVal(e.offsetX, "x")); });
+      over.addEventListener("click", (e) => { if (!this.live && Math.abs(e.clientX - down) < 4 && e.detail === 1) this.refer(plot.posToVal(e.offsetX, "x"), this.tree && e.altKey); });
       over.addEventListener("dblclick", () => this.everything());
     },
     resize() {

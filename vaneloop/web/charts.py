@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -41,6 +41,7 @@ __all__ = [
     "of_log",
     "of_stage",
     "painted",
+    "thinned",
     "view",
 ]
 
@@ -136,7 +137,7 @@ def view(curves: Curves, start: float | None, end: float | None, pixels: int) ->
             low, high = min(low, float(p.t[0])), max(high, float(p.t[-1]))
         i = 0 if start is None else max(0, int(np.searchsorted(p.t, start)) - 1)
         j = len(p.t) if end is None else min(len(p.t), int(np.searchsorted(p.t, end)) + 1)
-        x, lines = _thin(p.t[i:j], [t.y[i:j] for t in p.traces], n_out)
+        x, lines = thinned(p.t[i:j], [t.y[i:j] for t in p.traces], n_out)
         names = [{"name": t.name, "role": t.role, "width": t.width, "dash": t.dash} for t in p.traces]
         heads.append(
             {
@@ -160,7 +161,7 @@ def view(curves: Curves, start: float | None, end: float | None, pixels: int) ->
     return struct.pack("<I", len(head)) + head + bytes(-(4 + len(head)) % 8) + b"".join(body)
 
 
-def _thin(t: Array, lines: Sequence[Array], n_out: int) -> tuple[Array, list[Array]]:
+def thinned(t: Array, lines: Sequence[Array], n_out: int) -> tuple[Array, list[Array]]:
     """Points of all lines at the times that any of them needs."""
     if len(t) > n_out:
         t = np.ascontiguousarray(t)
@@ -201,9 +202,11 @@ class Over:
 
 def of_log(
     channels: Channels, key: str, over: Sequence[Over] = (), marks: Sequence[Mark] = (), spans: Sequence[Band] = (),
-    modes: bool = True,
+    modes: bool = True, made: Collection[str] = (),
 ) -> Curves:  # fmt: skip
     """All channels of a log, one below the other, holes open; those of other logs at the first one's samples.
+
+    made   names of those that formulas make
 
     modes  ``state`` is the controller's mode: stretches in a mode other than RUN are drawn
     """
@@ -216,7 +219,8 @@ def of_log(
                 _, t2, v2 = other.channels[name]
                 there = np.interp(np.asarray(x), np.asarray(t2) + other.later, v2, np.nan, np.nan)
                 lines.append(Trace(other.name, there, role, dash=dash))
-        panels.append(Panel(heading(name, unit), unit, np.asarray(x), lines, height=74, group=GROUP_OF.get(name, "")))
+        group = "formulas" if name in made else GROUP_OF.get(name, "")
+        panels.append(Panel(heading(name, unit), unit, np.asarray(x), lines, height=74, group=group))
     if modes and "state" in channels:
         _, t, values = channels["state"]
         spans = [*mode_bands(np.asarray(t), np.asarray(values)), *spans]
@@ -246,15 +250,19 @@ def of_stage(curves: Mapping[str, Any], by_hand: Mapping[str, Any] | None, key: 
 class Chart(Element, component="chart.js", esm={"uplot": "uplot"}):
     """Time curves in the browser; ``source`` names the curves at the server (`/curves/SOURCE`)."""
 
-    def __init__(self, source: str, live: float = 0.0, tree: bool = False):
+    def __init__(
+        self, source: str, live: float = 0.0, tree: bool = False,
+        cursors: tuple[float | None, float | None] = (None, None),
+    ):  # fmt: skip
         """``live``: questions a second of a chart whose curves move on by themselves; ``tree``: channels are found by
-        name.
+        name, and there are two ``cursors`` (s), of which the event "cursors" tells.
         """
         super().__init__()
         self._props["src"] = f"/curves/{source}"
         self._props["version"] = 0
         self._props["live"] = live
         self._props["tree"] = tree
+        self._props["cursors"] = list(cursors)
 
     def refetch(self) -> None:
         """Tell the browser that the curves have changed."""

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from hil.logs import Channel
+
 __all__ = ["CODE", "OTHER_SUFFIXES", "Choice", "LogFile", "Overlay", "safe_name"]
 
 OTHER_SUFFIXES = (".dbc", ".toml")  # beside a log: its database, a model file
@@ -91,11 +93,14 @@ class Choice:
 
 @dataclass(eq=False)
 class Overlay:
-    """Another log laid over the one chosen, ``later`` (s); its channels once it is read."""
+    """Another log laid over the one chosen, ``later`` (s); its channels once it is read, and as they are ``shown``,
+    with those that formulas make.
+    """
 
     file: LogFile
     later: float = 0.0
     channels: Mapping[str, tuple[str, Any, Any]] | None = None
+    shown: Mapping[str, Channel] = field(default_factory=dict)
 
 
 def safe_name(name: str) -> str:

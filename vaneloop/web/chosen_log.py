@@ -13,6 +13,7 @@ from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES
 from vaneloop.verbs.machine import files_of
 from vaneloop.web.charts import OVER, Chart
+from vaneloop.web.formulas import FormulaPart
 from vaneloop.web.frame import Live, card, drop, list_of_moments, notes_of, opened, table
 from vaneloop.web.session import CODE, OTHER_SUFFIXES, STOPPED, LogFile, Session, safe_name
 
@@ -111,7 +112,9 @@ class ChosenLog:
                 self.live.complaint("over")
                 self.live.progress("over")
                 list_of_moments(self.live, lambda: s.moments, lambda t: chart.run_method("moment", t), "log")
-                chart = Chart("log", tree=True)
+                chart = Chart("log", tree=True, cursors=s.cursors)
+                chart.on("cursors", lambda e: s.set_cursors(*e.args))
+                FormulaPart(s, self.live).build()
             all_channels.props("dense")
             self.live.watch(chart.refetch, "log", "over")
 

@@ -12,12 +12,15 @@ import re
 import shlex
 import shutil
 from collections import Counter
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from hil.logs import Channel, Log, write_log
 from hil.logs.formats import is_framed
+from hil.logs.formula import Formula, named
+from vaneloop.base.errors import InputError
 from vaneloop.web import moments
 from vaneloop.web.charts import OVER, Curves, Mark, Over, of_log, of_stage
 from vaneloop.web.choice import CODE, OTHER_SUFFIXES, Choice, LogFile, Overlay, safe_name
@@ -72,6 +75,10 @@ class Session:
         self.extra: dict[str, Any] = {}  # what other pages keep
         self.choice = Choice(tables=tables)
         self.overlays: list[Overlay] = []
+        self.formulas: list[Formula] = []  # of channels; they stay when another log is chosen
+        self.made: dict[str, Channel | str] = {}  # what each formula makes of this log, or why it makes none
+        self.xy: dict[str, str] = {}  # x, y, colour: channels of the plot of one over the other
+        self.cursors: tuple[float | None, float | None] = (None, None)  # s, in the curves of the log
         self.offered: list[str] = []
         self.seen: dict[str, Any] | None = None  # what is known of its names and units (worker.look)
         self.draft: dict[str, str] = {}  # what is typed in the form and not yet read
@@ -80,6 +87,7 @@ class Session:
 
     def _clear_log(self) -> None:
         self.preview: dict[str, Any] | None = None
+        self.made = {}
         self.moments: list[moments.Moment] = []
         self._clear_results()
 
@@ -186,6 +194,7 @@ class Session:
                 file=file, dbc=dbc, model=first.model, bench=first.bench, tables=self.tables, system=self.choice.system
             )
             self.offered, self.seen, self.draft, self.overlays = [], None, {}, []
+            self.cursors = None, None
         if self.choice.file is not None:
             self.read()
         self.touch("log")
@@ -245,8 +254,7 @@ class Session:
         self.preview = await self.search.call("preview", "reading the log", words=words)
         if self.choice.system is None:
             self.moments = moments.of_log(self.preview["channels"], self.preview["faults"], self._marks())
-        self._draw_log()
-        self.touch("log")
+        await self._make_channels()
         if self.overlays:
             for o in self.overlays:
                 o.channels = None  # names and units may be others now
@@ -265,10 +273,91 @@ class Session:
         """Curves of the log, with what is laid over it."""
         if self.preview is None or self.choice.file is None:
             return
-        over = [Over(o.file.name, o.channels, o.later) for o in self.overlays if o.channels is not None]
+        over = [Over(o.file.name, _told(o.shown), o.later) for o in self.overlays if o.channels is not None]
         spans = moments.fault_bands(self.preview["faults"])
-        key, modes = str(self.choice.file.path), self.choice.system is None
-        self.curves["log"] = of_log(self.preview["channels"], key, over, self._marks(), spans, modes)
+        key, modes, made = str(self.choice.file.path), self.choice.system is None, list(self.made)
+        self.curves["log"] = of_log(_told(self.channels()), key, over, self._marks(), spans, modes, made)
+
+    # ---- channels of channels
+
+    def channels(self) -> dict[str, Channel]:
+        """Channels of the log chosen, and those that formulas make of them."""
+        read = {} if self.preview is None else _channels(self.preview["channels"])
+        return {**read, **{n: c for n, c in self.made.items() if isinstance(c, Channel)}}
+
+    async def add_formula(self, text: str) -> bool:
+        """Take one more formula, as ``vaneloop map --formula`` takes it; where it cannot be read or made, say why."""
+        self.errors.pop("formula", None)
+        try:
+            formula = named(text)
+            there = self.channels()
+            if formula.name in there or formula.name in self.made:
+                raise InputError(f"formula {text!r}, position 1: there is a channel {formula.name!r}; another name")
+            if self.preview is not None:
+                await asyncio.get_running_loop().run_in_executor(None, formula.made, there)
+        except InputError as e:
+            self.errors["formula"] = str(e)
+            self.touch("formula")
+            return False
+        self.formulas = [*self.formulas, formula]
+        self.do("formula", self._make_channels())
+        return True
+
+    def drop_formula(self, name: str) -> None:
+        """Take a formula away."""
+        self.formulas = [f for f in self.formulas if f.name != name]
+        self.do("formula", self._make_channels())
+
+    async def _make_channels(self) -> None:
+        """Make what the formulas say of the log and of those laid over it, beside the page; draw the curves."""
+        if self.preview is not None:
+            logs = [_channels(self.preview["channels"]), *(_channels(o.channels or {}) for o in self.overlays)]
+            loop, formulas, overlays = asyncio.get_running_loop(), self.formulas, self.overlays
+            made = [await loop.run_in_executor(None, _made, formulas, channels) for channels in logs]
+            if formulas is not self.formulas:
+                return  # another answer is on its way
+            self.made = made[0]
+            for o, channels, more in zip(overlays, logs[1:], made[1:], strict=True):
+                o.shown = {**channels, **{n: c for n, c in more.items() if isinstance(c, Channel)}}
+            for key in [k for k in self.saved if k.startswith("between-")]:
+                del self.saved[key]  # of other channels
+            self._draw_log()
+        self.touch("log", "formula", "over")
+
+    def set_cursors(self, first: float | None, second: float | None) -> None:
+        """Where the cursors of the log's curves are now, s."""
+        self.cursors = first, second
+        for key in [k for k in self.saved if k.startswith("between-")]:
+            del self.saved[key]  # of another part
+        self.touch("cursors")
+
+    def between(self) -> tuple[float, float] | None:
+        """The part of the log between both cursors, s; None where there are not two."""
+        a, b = self.cursors
+        return None if a is None or b is None or a == b else (min(a, b), max(a, b))
+
+    def save_channels(self, key: str, name: str) -> None:
+        """Write all channels, between the cursors, as a log."""
+        if self.channels():
+            self.do("export", self._save_channels(key, name))
+
+    async def _save_channels(self, key: str, name: str) -> None:
+        path, between = self.anew(key, name), self.between()
+        channels = {n: c if c.unit else replace(c, unit="-") for n, c in self.channels().items()}
+        try:
+            await asyncio.get_running_loop().run_in_executor(None, _write_part, path, channels, between)
+        except InputError as e:
+            raise WorkError(str(e)) from None
+        if between == self.between():
+            self.saved[key] = path
+        self.touch("export")
+
+    def export_command(self, name: str) -> str:
+        """The command that writes the same file."""
+        words = [w for f in self.formulas if isinstance(self.made.get(f.name), Channel) for w in ("--formula", f.text)]
+        if (between := self.between()) is not None:
+            words += ["--between", "{:.9g}:{:.9g}".format(*between)]
+        return shlex.join(["vaneloop", "map", *self.choice.reading(real=False), *words, "--export", name])
 
     def lay_over(self, file: LogFile) -> None:
         """Draw another log over this one, read in the same way."""
@@ -298,8 +387,7 @@ class Session:
                     if o in self.overlays:
                         self.take_off(o)
                     raise
-                self._draw_log()
-                self.touch("over")
+                await self._make_channels()
 
     async def _compare(self) -> None:
         words = self.words()
@@ -566,6 +654,37 @@ class Session:
                 w.stop()
         self._hand_wanted = False
         self.touch("jobs")
+
+
+def _channels(told: Mapping[str, tuple[str, Any, Any]]) -> dict[str, Channel]:
+    """Channels as the worker tells them: name -> unit, s, values."""
+    return {name: Channel(t, values, unit=unit) for name, (unit, t, values) in told.items()}
+
+
+def _told(channels: Mapping[str, Channel]) -> dict[str, tuple[str, Any, Any]]:
+    return {name: (c.unit, c.t, c.values) for name, c in channels.items()}
+
+
+def _made(formulas: Sequence[Formula], channels: Mapping[str, Channel]) -> dict[str, Channel | str]:
+    """What each formula makes of a log's channels, or the line that says why it makes none."""
+    out: dict[str, Channel | str] = {}
+    there = dict(channels)
+    for f in formulas:
+        try:
+            if f.name in channels:
+                raise InputError(f"formula {f.text!r}, position 1: this log has a channel {f.name!r}")
+            t, values, unit = f.made(there)
+            out[f.name] = there[f.name] = Channel(t, values, unit=unit)
+        except InputError as e:
+            out[f.name] = str(e)
+    return out
+
+
+def _write_part(path: Path, channels: dict[str, Channel], between: tuple[float, float] | None) -> None:
+    log = Log(path.name, channels, signals={})
+    if between is not None:
+        log = log[between[0] : between[1]]
+    write_log(path, log.channels)
 
 
 def _digest(path: Path) -> str:
