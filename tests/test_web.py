@@ -596,6 +596,17 @@ def test_the_form_says_the_options_of_a_command(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
+def test_further_logs_and_parts_are_the_options_of_a_command(tmp_path: Path) -> None:
+    from vaneloop.web.session import Choice, LogFile
+
+    log, other, third, model = (LogFile(tmp_path / n, n, n) for n in ("a.csv", "b.csv", "c.csv", "m.py"))
+    c = Choice(file=log, system=model, also=[other], test=[third], fit_part=":200 300:400", test_part="200:")
+    said = ["--also", "b.csv", "--fit", ":200", "300:400", "--test", "200:", "c.csv"]
+    assert c.words(real=False) == ["a.csv", "--system", "m.py", *said]
+    assert c.reading(real=False) == ["a.csv", "--system", "m.py"]  # map knows of one log
+    assert Choice(file=log, test_part="9:").words(real=True) == [str(log.path), "--test", "9:"]
+
+
 def amplifier(folder: Path) -> list[str]:
     """An amplifier that rectifies, the model that knows only its gain, and how a log that has another name for its
     input is held against that; as the words of a command.
@@ -641,6 +652,29 @@ def test_a_model_of_one_s_own_gets_the_answers_of_the_commands(tmp_path: Path) -
     assert worse["rms"]["y"] > 10.0 * better.rows()[0]["error_after"]
     page = Path(worker.report(told, words, diagnosed["diagnosis"], str(tmp_path / "page.html"), "vaneloop diagnose"))
     assert answer.sentence() in page.read_text(encoding="utf-8")
+
+
+def test_each_log_s_error_is_the_one_of_the_commands(tmp_path: Path) -> None:
+    import vaneloop
+    from vaneloop.pages.by_log import errors_by_log
+    from vaneloop.web import worker
+
+    words, told = amplifier(tmp_path), lambda *_: None
+    twin = tmp_path / "twin.csv"
+    twin.write_text((tmp_path / "amplifier.csv").read_text())
+    more = [*words, "--fit", ":7", "--test", "7:", str(twin)]
+    assert worker.compare(told, words)["apart"] is None
+    title, columns, rows = worker.compare(told, more)["apart"]
+    assert [r[:3] for r in rows][:3] == [
+        ["amplifier.csv :7", "fitted", "y"], ["amplifier.csv 7:", "test", "y"], ["twin", "test", "y"],
+    ] and "log by log" in title  # fmt: skip
+    system = vaneloop.load_system(words[-1])
+    record, other = (vaneloop.verbs.search.read_record(f, system, mapping={"Drive": "u"})[0] for f in (words[0], twin))
+    answer = vaneloop.compare(record, system, fit=(None, 7), test=[(7, None), other])
+    assert answer.by_log is not None and errors_by_log(answer.by_log) == (columns, rows)
+    _, *found = worker.diagnose(told, more)["apart"]
+    told_by_verb = vaneloop.diagnose(record, system, fit=(None, 7), test=[(7, None), other]).by_log
+    assert told_by_verb is not None and (found[0], found[1]) == errors_by_log(told_by_verb)
 
 
 def test_no_code_of_a_model_runs_before_the_user_has_allowed_what_it_says_now(tmp_path: Path) -> None:
@@ -722,7 +756,7 @@ def test_a_model_of_one_s_own_from_its_file_to_the_error_at_the_noise(
     page.get_by_role("button", name="Extended model").click()
     page.get_by_role("button", name="Go on with this model").click()
     page.locator(".verdict.good", has_text="fits").wait_for()
-    assert re.search("--system .*tank.py --model extended.toml", page.locator(".cmd code").first.inner_text())
+    assert re.search("--system .*tank.py --model extended.toml", page.locator(".cmd code", has_text=" compare ").inner_text())
 
     # a file of the user's own: nothing of it runs before the click; its log calls the input otherwise
     ran = tmp_path / "ran"
@@ -748,6 +782,46 @@ def test_a_model_of_one_s_own_from_its_file_to_the_error_at_the_noise(
     page.get_by_text("fails most in the amplifier subsystem").wait_for()
     page.get_by_role("button", name="Find the missing physics").click()
     page.get_by_text("The amplifier subsystem lacks y.absolute_value").first.wait_for()
+
+
+@pytest.mark.slow
+@needs_browser
+def test_a_law_of_a_model_of_one_s_own_is_learned_and_another_log_confirms_it(
+    server: Server, page: Any, tmp_path: Path
+) -> None:
+    """The tank of tests/test_learn.py: its outflow grows with the warmth of the oil."""
+    from tests.test_learn import logs_of_a_tank
+
+    logs_of_a_tank(tmp_path)
+    page.goto(server.url)
+    upload = page.locator("input[type=file]").first
+    upload.set_input_files(tmp_path / "tank.py")
+    page.locator(".run-code").click()
+    upload.set_input_files(tmp_path / "warm.csv")
+    page.get_by_text("fails most in the tank subsystem").wait_for()
+    upload.set_input_files(tmp_path / "cold.csv")
+    page.locator(".cmd code", has_text="vaneloop compare cold.csv").wait_for()
+    page.get_by_role("button", name='Expand "Fit and test"').click()
+    pick(page, ".log-test", "warm.csv")
+    apart = page.locator(".vtable", has_text="fitted or test")
+    apart.locator("tr", has_text="warm").wait_for()
+    page.get_by_label("seconds that are fitted").fill("1:0")
+    page.keyboard.press("Enter")
+    page.get_by_role("alert").filter(has_text="--fit '1:0': the end (=0 s) must be above").wait_for()
+    page.get_by_label("seconds that are fitted").fill("")
+    page.keyboard.press("Enter")
+    assert "--test warm.csv" in page.locator(".cmd code", has_text=" compare ").inner_text()
+    page.get_by_role("button", name="Find the missing physics").click()
+    page.get_by_role("button", name="Learn the law").click()
+    page.get_by_text("Outflow is multiplied by 1 + a function of oil").first.wait_for()
+    before, after = (float(x) for x in re.findall(r"[\d.]+", page.locator(".law-error").inner_text()))
+    assert after < 2.0 < before
+    looks(page, "own_learned")
+    page.locator(".add-law").click()
+    page.get_by_role("button", name="Go on with this model").click()
+    page.locator(".verdict.good", has_text="fits").wait_for()
+    said = page.locator(".cmd code", has_text=" compare ").inner_text()
+    assert re.search(r"cold.csv --system tank.py --model extended.toml --test warm.csv$", said)
 
 
 IN_ONE_TEST = ("locate", "replay", "extend", "diagnose", "experiment")  # the others where they are made anyway

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from vaneloop.pages.figures import UNDER, Line, Panel, bars, loop, overlay
 from vaneloop.pages.page import Page
 from vaneloop.pages.style import interval
 
-__all__ = ["curves_by_log", "heads", "log_by_log", "short_names"]
+__all__ = ["curves_by_log", "errors_by_log", "heads", "log_by_log", "short_names"]
 
 OTHER_SUFFIXES = (".json", ".mat", ".txt")  # of runs that a program of the user's own has read
 SHOWN = 6  # logs whose curves are drawn
@@ -33,9 +34,17 @@ def heads(by_log: ByLog) -> list[str]:
     return ["model", *(f"+ {step.split(' + ')[-1]}" for step in list(by_log.steps)[1:])]
 
 
+def errors_by_log(by_log: ByLog) -> tuple[list[str], list[list[Any]]]:
+    """Columns and rows: the RMS error of each log, after each step."""
+    d = by_log.d
+    short = short_names(list(next(iter(by_log.steps.values()))))
+    rows = [[short.get(log, log), what, d.outputs[k], *errors, d.units[k]] for log, what, k, errors, _ in by_log.rows()]
+    return ["log", "fitted or test", "signal", *heads(by_log), "unit"], rows
+
+
 def log_by_log(page: Page, by_log: ByLog) -> None:
     """Errors of every log after every step, which law helps where, and the model's own parameters."""
-    d, fitted = by_log.d, by_log.logs.fitted
+    fitted = by_log.logs.fitted
     logs = list(next(iter(by_log.steps.values())))
     short = short_names(logs)
     page.section(
@@ -43,8 +52,7 @@ def log_by_log(page: Page, by_log: ByLog) -> None:
         "RMS error of the model as it was given, then with each law added, every step refitted to the fitted logs "
         "alone. A law that only imitates what is missing degrades some validation log.",
     )
-    rows = [[short.get(log, log), what, d.outputs[k], *errors, d.units[k]] for log, what, k, errors, _ in by_log.rows()]
-    page.table(["log", "fitted or test", "signal", *heads(by_log), "unit"], rows)
+    page.table(*errors_by_log(by_log))
     if by_log.ablation:
         names = list(by_log.ablation)
         page.section(

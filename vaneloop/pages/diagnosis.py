@@ -41,10 +41,20 @@ from vaneloop.pages.story import (
 from vaneloop.pages.style import TONE_OF, Tone, capital, interval, number
 
 __all__ = [
-    "compare_page", "diagnosis_page", "experiment_page", "experiment_panels",
-    "experiment_rows", "extended_page", "located_sentence", "located_tone",
+    "APART",
+    "compare_page",
+    "diagnosis_page",
+    "errors_apart",
+    "experiment_page",
+    "experiment_panels",
+    "experiment_rows",
+    "extended_page",
+    "located_sentence",
+    "located_tone",
     "verdict_sentence",
 ]  # fmt: skip
+
+APART = "On the part that nothing was fitted to"
 
 
 def verdict_sentence(d: Diagnosis, by_log: ByLog | None = None) -> str:
@@ -166,12 +176,14 @@ def compare_page(
 def _tested(page: Page, rows: Sequence[Any]) -> None:
     """Errors on the part of the log that nothing was fitted to (`vaneloop.verbs.parts.Tested`)."""
     if rows:
-        page.section("On the part that nothing was fitted to", "RMS error with the parameters of the fitted part.")
-        columns = ["subsystem", "signal", "error before", "error after", "noise floor", "unit", "samples"]
-        page.table(
-            columns,
-            [[r.stage, r.signal, r.error_before, r.error_after, r.noise_floor, r.unit, r.samples] for r in rows],
-        )
+        page.section(APART, "RMS error with the parameters of the fitted part.")
+        page.table(*errors_apart(rows))
+
+
+def errors_apart(rows: Sequence[Any]) -> tuple[list[str], list[list[Any]]]:
+    """Columns and rows of `vaneloop.verbs.parts.Tested`."""
+    columns = ["subsystem", "signal", "error before", "error after", "noise floor", "unit", "samples"]
+    return columns, [[r.stage, r.signal, r.error_before, r.error_after, r.noise_floor, r.unit, r.samples] for r in rows]
 
 
 def extended_page(

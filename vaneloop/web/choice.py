@@ -37,6 +37,8 @@ class Choice:
 
     system  model of the user's own; None: the vane chain of ``tables``
     model   what is known of either by now: parameters as fitted, effects added
+    also, test            further logs that are fitted, and that only test, with ``system``
+    fit_part, test_part   seconds of the log that are fitted, and that only test: FROM:TO; "": all, none
     """
 
     file: LogFile | None = None
@@ -49,6 +51,10 @@ class Choice:
     guess: bool = True
     tables: str | None = None
     system: LogFile | None = None
+    also: list[LogFile] = field(default_factory=list)
+    test: list[LogFile] = field(default_factory=list)
+    fit_part: str = ""
+    test_part: str = ""
 
     def beside(self) -> list[str]:
         """Names of the files that are taken beside the log."""
@@ -61,21 +67,25 @@ class Choice:
 
         out = self.reading(real)
         if self.model is not None:
-            out += ["--model", str(self.model.path) if real else self.model.word]
+            out += ["--model", _place(self.model, real)]
         if self.tables is not None and self.system is None:
             out += ["--tables", self.tables]
+        tests = [*([self.test_part] if self.test_part else []), *(_place(f, real) for f in self.test)]
+        further = (
+            ("--also", [_place(f, real) for f in self.also]),
+            ("--fit", self.fit_part.split()),
+            ("--test", tests),
+        )
+        for option, given in further:
+            out += [option, *given] if given else []
         return out
 
     def reading(self, real: bool) -> list[str]:
         """Those of them that say how the log is read."""
-
-        def place(f: LogFile) -> str:
-            return str(f.path) if real else f.word
-
         assert self.file is not None
-        out = [place(self.file)]
+        out = [_place(self.file, real)]
         if self.dbc is not None:
-            out += ["--dbc", place(self.dbc)]
+            out += ["--dbc", _place(self.dbc, real)]
         for signal, name in self.mapping.items():
             out += ["--map", f"{name}={signal}"]
         for signal, unit in self.units.items():
@@ -83,12 +93,17 @@ class Choice:
         if self.design_rpm.strip():
             out += ["--design-rpm", self.design_rpm.strip()]
         if self.bench is not None:
-            out += ["--mapping", place(self.bench)]
+            out += ["--mapping", _place(self.bench, real)]
         if not self.guess:
             out += ["--no-guess"]
         if self.system is not None:
-            out += ["--system", place(self.system)]
+            out += ["--system", _place(self.system, real)]
         return out
+
+
+def _place(file: LogFile, real: bool) -> str:
+    """A file as the worker needs it, else as the user would type it."""
+    return str(file.path) if real else file.word
 
 
 @dataclass(eq=False)

@@ -15,6 +15,7 @@ from vaneloop.verbs.machine import files_of
 from vaneloop.web.charts import OVER, Chart
 from vaneloop.web.formulas import FormulaPart
 from vaneloop.web.frame import Live, card, drop, list_of_moments, notes_of, opened, table
+from vaneloop.web.further import FurtherPart
 from vaneloop.web.session import CODE, OTHER_SUFFIXES, STOPPED, LogFile, Session, safe_name
 
 __all__ = ["ChosenLog", "receive", "suffixes"]
@@ -101,6 +102,7 @@ class ChosenLog:
                 with ui.element("div").classes("stackc"):
                     self.live.part(self._channels, "log", shows=lambda: (s.choice.file, s.preview, *s.choice.beside()))
             self.live.part(self._form, "log", "compare", shows=self._form_shows)
+            FurtherPart(self.s, self.live)
             with ui.expansion("All channels", value=False).classes("w-full") as all_channels:
                 self.live.part(
                     self._other,

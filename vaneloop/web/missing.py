@@ -33,6 +33,7 @@ from vaneloop.pages.style import capital, number
 from vaneloop.web.charts import Chart
 from vaneloop.web.chosen_log import ChosenLog
 from vaneloop.web.frame import Live, card, command_line, dark, figure_of, frame, notes_of, opened, table, tone
+from vaneloop.web.further import show_apart
 from vaneloop.web.learning import LearnedPart
 from vaneloop.web.session import LogFile, Session
 
@@ -132,6 +133,7 @@ class _Page:
         ui.label(f"Nominal parameters are refitted within their tolerances.{as_given}").classes("note")
         known = s.preview["notes"] if s.preview else []
         notes_of(s, "What judging did to the log", [n for n in c["notes"] if n not in known])
+        show_apart(c["apart"])
         self.live.part(self._whole_loop, "compare", "loop", shows=lambda: (s.loop,))
         command_line(s.command("compare"))
         command_line(s.command("locate"))
@@ -268,6 +270,7 @@ class _Page:
                 said += [f"Nearest to it in the library, for the {u['stage']} subsystem: {near}."] if near else []
                 if said:
                     ui.label(" ".join(said)).classes("note")
+            show_apart(s.diagnosis["apart"])
         command_line(s.command("diagnose"))
 
     def _stages(self) -> None:

@@ -29,6 +29,7 @@ from vaneloop.web.jobs import Cancelled, Job, Spare, Worker, WorkError
 __all__ = ["CODE", "OTHER_SUFFIXES", "STOPPED", "Choice", "LogFile", "Session", "safe_name"]
 
 STOPPED = "stopped; nothing is kept of it, start it again when you like"  # in place of a complaint
+SEARCHED = ("compare", "loop", "diagnose", "learn", "fit", "experiment", "save")  # sections of a comparison
 LEADERS = 4  # candidate effects whose fits are made ahead
 
 
@@ -238,13 +239,35 @@ class Session:
         """Read the log as the form says, then compare it with the model."""
         self.stop()
         self._clear_log()
-        self.errors = {
-            k: v
-            for k, v in self.errors.items()
-            if k not in ("log", "compare", "loop", "diagnose", "learn", "fit", "experiment", "save")
-        }
-        self.touch("log", "compare", "diagnosis", "learn", "fit", "experiment")
+        self._forget("log", *SEARCHED)
         self.do("log", self._read())
+
+    def _forget(self, *sections: str) -> None:
+        """Take the complaints of these sections away, and have them drawn anew."""
+        self.errors = {k: v for k, v in self.errors.items() if k not in sections}
+        self.touch(*sections, "diagnosis")
+
+    def take_parts(self, fit: str, test: str) -> None:
+        """Which seconds of the log are fitted and which only test, as ``--fit`` and ``--test`` take them."""
+        if (fit, test) != (self.choice.fit_part, self.choice.test_part):
+            self.choice.fit_part, self.choice.test_part = fit, test
+            self._held_anew()
+
+    def take_logs(self, which: str, files: Sequence[LogFile]) -> None:
+        """Further logs: those of ``--also`` (which: also) or ``--test`` (test)."""
+        setattr(self.choice, which, list(files))
+        self._held_anew()
+
+    def _held_anew(self) -> None:
+        """Compare anew, with what is fitted and tested now."""
+        self.touch("further")
+        if self.preview is None:
+            return
+        self.stop()
+        self._clear_results()
+        self._forget(*SEARCHED)
+        if self.preview["channels"]:
+            self.do("compare", self._compare())
 
     async def _read(self) -> None:
         words = self.words()

@@ -46,13 +46,15 @@ from vaneloop.fleet.tables import answers, roll_up
 from vaneloop.identification import System
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.workflow import locate_stages
-from vaneloop.pages.diagnosis import diagnosis_page, located_tone
+from vaneloop.pages.by_log import errors_by_log
+from vaneloop.pages.diagnosis import APART, diagnosis_page, errors_apart, located_tone
 from vaneloop.pages.fleet import fleet_page, log_page
 from vaneloop.pages.schedule import NAMES, schedule_page
 from vaneloop.pages.story import fall, word
 from vaneloop.verbs.learn import with_path
 from vaneloop.verbs.machine import Machine
 from vaneloop.verbs.parts import read_record, signals_of
+from vaneloop.verbs.search import Diagnosed, Stages
 from vaneloop.verbs.search import experiment as recommend
 from vaneloop.web.held import Held, held, system_of
 from vaneloop.web.process import Progress, answer, parsed
@@ -166,8 +168,17 @@ def compare(progress: Progress, words: list[str]) -> dict[str, Any]:
         "figures": [f for x in answer.located for f in x.signals], "located": {x.stage: x for x in answer.located},
         "verdict": answer.sentence(), "tone": located_tone(answer.located), "curves": curves,
         "not_observed": it.bound.not_observed, "notes": it.bound.notes,
-        "windows": {x.name: x.window for x in it.bound.stages},
+        "windows": {x.name: x.window for x in it.bound.stages}, "apart": apart(answer),
     }  # fmt: skip
+
+
+def apart(answer: Stages | Diagnosed) -> tuple[str, list[str], list[list[Any]]] | None:
+    """Title, columns and rows of the errors of each log apart, or of the part that only tests; None: there is none."""
+    if answer.by_log is not None:
+        logs = answer.by_log.logs
+        several = len(logs.fitted.logs) > 1 or logs.test is not None
+        return ("RMS error, log by log", *errors_by_log(answer.by_log)) if several else None
+    return (APART, *errors_apart(answer.tested)) if answer.tested else None
 
 
 def whole_loop(progress: Progress, words: list[str], floors: dict[str, float]) -> tuple[list[Any], str]:
@@ -213,7 +224,9 @@ def diagnose(progress: Progress, words: list[str]) -> dict[str, Any]:
         progress(n.fraction, n.text)
 
     answer = it.diagnosed(news)
-    return {"diagnosis": answer.diagnosis, "json": answer.to_dict(), "verdict": answer.sentence()}
+    return {
+        "diagnosis": answer.diagnosis, "json": answer.to_dict(), "verdict": answer.sentence(), "apart": apart(answer),
+    }  # fmt: skip
 
 
 def refit(progress: Progress, words: list[str], stage: str, effects: tuple[str, ...]) -> dict[str, Any]:
