@@ -71,6 +71,27 @@ def own(page: Any) -> None:
     page.wait_for_timeout(3000)
 
 
+def formulas(page: Any) -> None:
+    """A channel made by a formula, over another."""
+    page.locator(".choose").click()
+    page.get_by_role("option", name="hidden_effect.parquet").click()
+    page.get_by_text("All channels").first.click()
+    for text in ("v = rate(x_dem)", "lag = x_dem - x_lvdt [um]"):
+        page.get_by_label("formula", exact=True).fill(text)
+        page.get_by_label("formula", exact=True).press("Enter")
+        page.locator(".made", has_text=text.split()[0]).wait_for()
+    for k, t in ((1, "75"), (2, "100")):
+        page.get_by_label(f"cursor {k} [s]").fill(t)
+        page.get_by_label(f"cursor {k} [s]").press("Enter")
+    for axis, name in (("x", "v"), ("y", "lag")):
+        page.locator(f".xy-{axis}").click()
+        page.get_by_role("option", name=name, exact=True).last.click()
+        page.locator(".q-menu").wait_for(state="detached")
+    page.locator(".xy-said").wait_for()
+    page.get_by_text("fails most in the").wait_for()
+    page.locator(".formulas").evaluate("(e) => e.scrollIntoView()")
+
+
 def schedule(page: Any) -> None:
     """The mechanism drawn to scale."""
     page.get_by_role("button", name="Mechanism").click()
@@ -111,6 +132,7 @@ def fleet(page: Any) -> None:
 WORK = (
     ("", "missing", missing),
     ("", "own", own),
+    ("", "formulas", formulas),
     ("schedule", "schedule", schedule),
     ("run", "run", run),
     ("run", "calibrate", calibrate),

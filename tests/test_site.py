@@ -120,6 +120,7 @@ SEARCHES = {
     ".mf4": "logs", ".blf": "logs", ".parquet": "logs", ".a2l": "xcp", ".fmu": "fmu", ".dbc": "logs",
     "export-fmu": "reference/commands/export-fmu", "new-controller": "reference/commands/new-controller",
     "least squares": "methods", "hysteresis": "effects", "Simulink": "coming_from_simulink",
+    "--formula": "reference/commands/map", "calculated channel": "logs", "XY plot": "workbench",
     "CAPL": "coming_from_canoe", "vaneloop.diagnose": "reference",
 }  # fmt: skip
 # pages of every kind, which are held against axe-core

@@ -138,7 +138,7 @@ class Correlation(_Named, Mapping[str, Mapping[str, float]]):
 
     def _table(self) -> tuple[list[str], list[list[object]]]:
         rows = zip(self._names, self._values, strict=True)
-        return ["", *self._names], [[name, *(round(float(v), 3) for v in row)] for name, row in rows]
+        return ["", *self._names], [[name, *(round(float(v), 3) + 0.0 for v in row)] for name, row in rows]
 
 
 def _names(of: Sequence[Sequence[Estimate]]) -> list[list[str]]:

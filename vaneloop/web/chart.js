@@ -14,7 +14,7 @@ export default {
       <select v-if="Object.keys(kept).length" class="curves-tool" aria-label="show a layout that was kept" @change="recall($event.target.value)">
         <option value="" :selected="!shown">layouts kept</option><option v-for="(_, n) in kept" :key="n" :value="n" :selected="n === shown">{{ n }}</option></select>
       <button v-if="kept[name]" type="button" class="curves-tool" @click="forget" :aria-label="'forget the layout ' + name">Forget</button>
-      <label v-for="k in 2" :key="k" class="curves-cursor">cursor {{ k }} [s] <input class="curves-find" inputmode="decimal" :value="typed[k - 1]" @change="type_(k, $event.target)" @keydown.enter="type_(k, $event.target)"></label>
+      <label v-for="k in 2" :key="k" class="curves-cursor">cursor {{ k }} [s] <input class="curves-find" inputmode="decimal" v-model="typed[k - 1]" @change="type_(k)" @keydown.enter="type_(k)"></label>
       <span v-if="apart" class="curves-apart">{{ apart }}</span></template></div>
     <div v-if="wrong" class="complaint" role="alert">{{ wrong }}</div>
     <details v-if="tools && tree" class="curves-tree"><summary>Channels: {{ names.filter((c) => wanted(c)).length }} of {{ names.length }} shown</summary>
@@ -34,6 +34,7 @@ export default {
     this.busy = false;
     this.again = false;
     this.hidden = {};
+    this.known = [null, null];
     [this.at, this.to] = this.cursors || [null, null]; // s: cursor 1, the reference, and cursor 2
     this.kept = JSON.parse(localStorage.getItem("layouts " + this.src) || "{}");
     this.sizes = new ResizeObserver(() => this.resize());
@@ -343,17 +344,19 @@ export default {
     told(out = true) {
       // say where the cursors are: in the fields, and to the server
       const said = (t) => (t === null ? "" : String(+t.toFixed(6)));
-      this.typed = [said(this.at), said(this.to)];
+      [this.at, this.to].forEach((t, k) => { // what is being typed stays, unless the cursor has moved
+        if (t !== this.known[k]) { this.known[k] = t; this.typed[k] = said(t); }
+      });
       this.apart = this.at === null || this.to === null ? "" : `${+Math.abs(this.to - this.at).toPrecision(6)} s apart`;
       this.wrong = "";
       const now = JSON.stringify([this.at, this.to]);
       if (out && this.tree && now !== this.sent) this.$emit("cursors", [this.at, this.to]);
       this.sent = now;
     },
-    type_(k, field) {
-      const text = field.value.trim().replace(",", "."), t = Number(text), [low, high] = this.head.span, before = k === 1 ? this.at : this.to;
+    type_(k) {
+      const typed = this.typed[k - 1].trim(), text = typed.replace(",", "."), t = Number(text), [low, high] = this.head.span, before = k === 1 ? this.at : this.to;
       if (text && !(t >= low && t <= high)) {
-        this.wrong = `cursor ${k} (=${field.value.trim()}) must be a time of the log, ${+low.toPrecision(9)} to ${+high.toPrecision(9)} s`;
+        this.wrong = `cursor ${k} (=${typed}) must be a time of the log, ${+low.toPrecision(9)} to ${+high.toPrecision(9)} s`;
         return;
       }
       const next = text ? t : null;
