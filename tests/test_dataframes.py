@@ -248,6 +248,15 @@ def test_an_answer_is_short_in_a_console_and_light_in_a_notebook(better: Extende
         assert len(answer.show()._repr_html_()) > 20 * MOST_BYTES > len(repr(answer.show()))
 
 
+def test_a_cell_of_a_notebook_has_the_words_of_the_pages(better: Extended, log: vaneloop.Log) -> None:
+    found = Diagnosed(better.bound, better.diagnosis, "log")
+    quiet = dataclasses.replace(better.diagnosis.stages[0], verdict="none")
+    fits = Diagnosed(better.bound, dataclasses.replace(better.diagnosis, stages=[quiet]), "log")
+    assert ">missing<" in found._repr_html_() and ">explained<" in better._repr_html_()
+    page = fits._repr_html_()
+    assert ">fits<" in page and ">none<" not in page and fits.rows()[0]["verdict"] == "none"
+
+
 def test_a_picture_is_drawn_on_the_axes_that_are_given(better: Extended, log: vaneloop.Log) -> None:
     figure = pytest.importorskip("matplotlib.figure").Figure()
     above, below = figure.subplots(2)

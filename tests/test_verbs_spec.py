@@ -1220,9 +1220,9 @@ def test_what_the_log_does_not_show_cannot_be_fitted(monkeypatch: pytest.MonkeyP
     with pytest.raises(InputError, match=r"--effect bend: the log does not show its subsystem .engine: no n_r"):
         search.extended(chain, ["bend"], Model(curves={"bend": curve}), "a.csv")
     chain.not_observed = {}
-    with pytest.raises(InputError, match=r"--effect rotor_lag_error: .*engine: not observed"):
+    with pytest.raises(InputError, match=r"--effect rotor_lag_error: .*engine: cannot tell from this log"):
         search.extended(chain, ["rotor_lag_error"], Model(), "a.csv")
-    with pytest.raises(InputError, match=r"--effect bend: .*engine: not observed"):
+    with pytest.raises(InputError, match=r"--effect bend: .*engine: cannot tell from this log"):
         search.extended(chain, ["bend"], Model(curves={"bend": curve}), "a.csv")
     assert search.extended(chain, [], Model(effects={"rotor_lag_error": {}}), "a.csv").diagnosis.stages == []
 

@@ -18,6 +18,7 @@ from vaneloop.base.errors import InputError, meant
 from vaneloop.base.extras import is_there, needed, needs
 from vaneloop.base.notebook import html_table
 from vaneloop.base.signals import heading
+from vaneloop.pages.story import verdict_word
 from vaneloop.pages.style import THEMES, painted
 from vaneloop.verbs.curves import Curves, curves_of_stages
 from vaneloop.verbs.estimates import Correlation, Fitted, Parameters, correlation_of, parameters_of
@@ -206,7 +207,8 @@ class Answer:
         parts = [f"<p><strong>{html.escape(self.sentence())}</strong></p>"]
         if rows := list(self.rows()):
             columns = list(rows[0])
-            parts.append(html_table(columns, [[row.get(c) for c in columns] for row in rows[:ROWS]]))
+            told = [{**row, "verdict": verdict_word(str(row.get("verdict")))} for row in rows[:ROWS]]
+            parts.append(html_table(columns, [[row.get(c) for c in columns] for row in told]))
             if len(rows) > ROWS:
                 parts.append(f"<p>and {len(rows) - ROWS} rows more: <code>answer.to_frame()</code></p>")
         parts.append(self._picture())

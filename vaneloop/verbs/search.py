@@ -48,7 +48,7 @@ from vaneloop.pages.diagnosis import (
     located_sentence,
     verdict_sentence,
 )
-from vaneloop.pages.story import EXPLAINED, MISSING, extended_sentence, reached
+from vaneloop.pages.story import CANNOT, EXPLAINED, MISSING, extended_sentence, reached
 from vaneloop.verbs.answer import COLOUR, Answer, Row, axes, labelled
 from vaneloop.verbs.curves import Curves, curves_of_logs
 from vaneloop.verbs.estimates import Fitted
@@ -690,7 +690,7 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
         shown = PLACES[f"{law.at} {law.how}"].stages if law else EFFECTS[name].stages
         places[name] = [s for s in shown if any(s == c.name for c in chain.stages)]
         if not places[name] and (law or name in wanted):
-            why = "; ".join(f"{s}: {chain.not_observed.get(s, 'not observed')}" for s in shown)
+            why = "; ".join(f"{s}: {chain.not_observed.get(s, CANNOT)}" for s in shown)
             raise InputError(f"{log}: --effect {name}: the log does not show its subsystem ({why})")
 
     def fitted_in(stages: Chain, by_stage: Mapping[str, Sequence[str]]) -> Chain:
