@@ -101,7 +101,7 @@ def test_any_two_rasters_give_rising_times_that_both_have(n: int, m: int, seed: 
     a, b = (np.cumsum(rng.uniform(0.01, 1.0, k)) + rng.uniform(0.0, 5.0) for k in (n, m))
     channels = {"a": channel(a, rng.standard_normal(n)), "b": channel(b, rng.standard_normal(m))}
     try:
-        made = formula_of("a + 2 * b").made(channels)
+        made = formula_of("a + 2 * b + 0 * c").made(channels | {"c": channel([0.0, 1e3], [1.0, 2.0])})
     except FormulaError as e:
         assert "no finite number" in str(e)
         return

@@ -94,6 +94,10 @@ def test_the_page_of_the_json_has_the_keys_that_a_command_writes(site: Path) -> 
         assert key in text, key
 
 
+def test_no_heading_of_a_table_is_without_words(site: Path) -> None:
+    assert [p.name for p in site.rglob("*.html") if re.search(r"<th[^>]*></th>", p.read_text(encoding="utf-8"))] == []
+
+
 def test_the_search_finds_options_and_effects_and_nothing_is_fetched(site: Path) -> None:
     index = json.loads((site / "search/search_index.json").read_text(encoding="utf-8"))
     found = {d["location"].split("#")[0] for d in index["docs"] if "valve_dead_band" in d["text"] + d["title"]}
@@ -124,7 +128,10 @@ SEARCHES = {
     "CAPL": "coming_from_canoe", "vaneloop.diagnose": "reference",
 }  # fmt: skip
 # pages of every kind, which are held against axe-core
-PAGES = ("index", "diagnosis", "settings", "notebooks/missing_physics", "reference/commands/run", "reference/python")
+PAGES = (
+    "index", "diagnosis", "fmu", "coming_from_canoe", "settings", "notebooks/missing_physics",
+    "reference/commands/run", "reference/python",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

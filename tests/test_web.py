@@ -471,7 +471,7 @@ def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
     for ours, unit in (("n_dem", "rpm"), ("n_r", "rpm"), ("x_lvdt", "m")):
         page.get_by_label(f"unit of {ours} in the log").fill(unit)
     page.get_by_role("button", name="Use 38000 rpm").click()
-    page.locator(".cmd code", has_text="--design-rpm 38000").first.wait_for()
+    page.locator(".cmd code", has_text=re.compile(r" compare .*--design-rpm 38000")).first.wait_for()
     page.get_by_text("fails most in the").wait_for()
     assert page.get_by_label("name of n_r in the log").input_value() == "N1"
     # typed and confirmed with Enter, a name stays; all of it is saved as the file that --mapping takes
@@ -479,7 +479,7 @@ def test_names_and_units_are_given_in_a_form(server: Server, page: Any) -> None:
     page.get_by_label("name of x_dem in the log").click()
     page.keyboard.type("x_dem")
     page.keyboard.press("Enter")
-    page.locator(".cmd code", has_text="--map x_dem=x_dem").first.wait_for()
+    page.locator(".cmd code", has_text=re.compile(r" compare .*--map x_dem=x_dem")).first.wait_for()
     page.get_by_text("fails most in the").wait_for()
     page.get_by_role("button", name="Save as mapping file").click()
     with page.expect_download() as download:

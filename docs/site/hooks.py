@@ -48,7 +48,10 @@ MADE_FROM = {
     "vaneloop/identification/candidates/library.py": "reference/laws.md",
 }
 # what a screen reader is not told: markup as Material writes it -> with a name, or reached by keyboard
-UNNAMED = {'data-md-component="search" role="dialog"': 'data-md-component="search" role="dialog" aria-label="Search"'}
+UNNAMED = {
+    'data-md-component="search" role="dialog"': 'data-md-component="search" role="dialog" aria-label="Search"',
+    "<th></th>": "<td></td>",  # a heading without words is none
+}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

@@ -143,6 +143,8 @@ class _Value:
 def _on(x: _Value, t: Array) -> Array:
     """Samples at other times; NaN outside, and in a hole."""
     assert x.t is not None
+    if not t.size:
+        return t
     if x.held:
         out = x.values[np.clip(np.searchsorted(x.t, t, side="right") - 1, 0, None)].astype(float)
         out[(t < x.t[0]) | (t > x.t[-1])] = np.nan
@@ -155,16 +157,15 @@ def _on(x: _Value, t: Array) -> Array:
 
 def _together(*parts: _Value) -> tuple[Array | None, list[Any]]:
     """The finest raster of all parts, and the values of each on it."""
-    sampled = [p for p in parts if p.t is not None]
-    if not sampled:
+    times = [p.t for p in parts if p.t is not None]
+    if not times:
         return None, [p.values for p in parts]
-    finest = min(sampled, key=lambda p: float(np.median(np.diff(p.t))) if len(p.t) > 1 else np.inf)
-    t = finest.t
-    same = [p.t is None or p.t is t or np.array_equal(p.t, t) for p in parts]
-    if not all(same):
-        t = t[(t >= max(p.t[0] for p in sampled)) & (t <= min(p.t[-1] for p in sampled))]
-        return t, [p.values if p.t is None else _on(p, t) for p in parts]
-    return t, [p.values for p in parts]
+    t = min(times, key=lambda t: float(np.median(np.diff(t))) if t.size > 1 else np.inf if t.size else -1.0)
+    if all(other is t or np.array_equal(other, t) for other in times):
+        return t, [p.values for p in parts]
+    if t.size:  # else no sample is left of a part
+        t = t[(t >= max(other[0] for other in times)) & (t <= min(other[-1] for other in times))]
+    return t, [p.values if p.t is None else _on(p, t) for p in parts]
 
 
 def _made(f: Callable[..., Any], parts: list[_Value], unit: Powers, held: bool = False) -> _Value:
@@ -274,7 +275,8 @@ def _sampled(parts: list[_Value], name: str) -> tuple[Array, Array]:
 def _rate(parts: list[_Value]) -> _Value:
     t, v = _sampled(parts, "rate")
     out = np.gradient(v, t)
-    out[(at := holes(t))] = out[at + 1] = np.nan  # beside a hole nobody knows
+    at = holes(t)
+    out[at] = out[at + 1] = np.nan  # beside a hole nobody knows
     return _Value(out, _product(parts[0].unit, (("s", Fraction(1)),), Fraction(-1)), t)
 
 
@@ -297,7 +299,8 @@ def _delay(parts: list[_Value]) -> _Value:
 
 def _mean(parts: list[_Value]) -> _Value:
     _, v = _sampled(parts, "mean")
-    return _Value(float(np.nanmean(v)), parts[0].unit)
+    finite = v[np.isfinite(v)]
+    return _Value(float(finite.mean()) if finite.size else np.nan, parts[0].unit)
 
 
 def _where(parts: list[_Value]) -> _Value:
@@ -549,10 +552,10 @@ class Formula:
                     what = f"is in {_said(now)}, which does not convert to {wanted}"
                     raise FormulaError(self.text, self._node.at, what)
                 now = _powers(wanted)
-        there = np.isfinite(values)
-        if not there.any():
+        finite = np.isfinite(values)
+        if not finite.any():
             raise FormulaError(self.text, self._node.at, "gives no finite number at any time that its channels share")
-        return Made(value.t[there], values[there], unit or self.unit or _said(now))
+        return Made(value.t[finite], values[finite], unit or self.unit or _said(now))
 
     def _wrong(self, name: str, what: str) -> FormulaError:
         return FormulaError(self.text, self._places[name], what)
