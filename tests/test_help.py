@@ -25,7 +25,7 @@ from vaneloop.cli.main import COMMANDS, GROUPS, IN_CHECKOUT, main
 
 _KINDS = "|".join(s[1:] for s in (*FORMATS, ".toml", ".dbc", ".html", ".py", ".json"))
 _FILE = re.compile(rf"[\w./-]+\.(?:{_KINDS})|[\w./-]+/")
-_MAKES = {"--out", "--record", "--report", "--json"}
+_MAKES = {"--out", "--export", "--record", "--report", "--json"}
 # what follows `vaneloop` or `python -m` -> the module that takes the words after it
 MODULES = {name: module for name, (module, _) in COMMANDS.items()} | {module: module for module in IN_CHECKOUT.values()}
 

@@ -129,7 +129,7 @@ SEARCHES = {
 }  # fmt: skip
 # pages of every kind, which are held against axe-core
 PAGES = (
-    "index", "diagnosis", "fmu", "coming_from_canoe", "settings", "notebooks/missing_physics",
+    "index", "diagnosis", "add_an_effect", "coming_from_canoe", "workbench", "settings", "notebooks/missing_physics",
     "reference/commands/run", "reference/python",
 )  # fmt: skip
 

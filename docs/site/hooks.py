@@ -51,6 +51,7 @@ MADE_FROM = {
 UNNAMED = {
     'data-md-component="search" role="dialog"': 'data-md-component="search" role="dialog" aria-label="Search"',
     "<th></th>": "<td></td>",  # a heading without words is none
+    '<nav class="md-nav" aria-label="': '<nav class="md-nav" aria-label="On this page: ',  # a page may have that name
 }
 
 
