@@ -145,13 +145,15 @@ def _on(x: _Value, t: Array) -> Array:
     assert x.t is not None
     if not t.size:
         return t
+    before = np.clip(np.searchsorted(x.t, t, side="right") - 1, 0, None)
     if x.held:
-        out = x.values[np.clip(np.searchsorted(x.t, t, side="right") - 1, 0, None)].astype(float)
+        out = x.values[before].astype(float)
         out[(t < x.t[0]) | (t > x.t[-1])] = np.nan
     else:
         out = np.interp(t, x.t, x.values, np.nan, np.nan)
-    for k in holes(x.t):
-        out[(t > x.t[k]) & (t < x.t[k + 1])] = np.nan
+    ends = np.zeros(x.t.size, bool)  # samples behind which there is a hole
+    ends[holes(x.t)] = True
+    out[ends[before] & (t > x.t[before])] = np.nan
     return out
 
 
