@@ -22,7 +22,7 @@ from vaneloop.identification.unmodelled.regressors import Quantity
 from vaneloop.identification.user_models.terms import COLUMN
 from vaneloop.identification.vane_chain import experiment
 from vaneloop.identification.vane_chain.actuator import _quadratic_drag
-from vaneloop.identification.vane_chain.alignment import Late, _explains, _shifted, aligned, late_vanes
+from vaneloop.identification.vane_chain.alignment import Late, _explains, _shifted, aligned, driving, late_vanes
 from vaneloop.identification.vane_chain.candidates import (
     VaneChainCandidates,
     _says_more,
@@ -56,6 +56,7 @@ from vaneloop.identification.vane_chain.demand import _direction_known
 from vaneloop.identification.vane_chain.linkage import _cross_talk, _crossed, _late_recorder
 from vaneloop.identification.vane_chain.parameters import FREE, _starts, declared, like_temperature, like_time
 from vaneloop.identification.vane_chain.resample import (
+    Gaps,
     Grid,
     every_other,
     grid_of,
@@ -125,19 +126,22 @@ def test_a_log_comes_on_its_raster_with_its_gaps_told() -> None:
         n_dem=(slow, slow), p_s=([5.0], [18.0]),
     )  # fmt: skip
     g = grid_of(log)
-    rows, columns, fresh, missing, notes = on_raster(log, g)
+    rows, columns, gaps, notes = on_raster(log, g)
+    missing = gaps.lost["n_r"]
     assert rows == pytest.approx(0.01 * np.arange(g.rows)) and notes == [] and set(columns) == set(log.channels)
     assert columns["n_r"][kept[: g.rows]] == pytest.approx(np.sin(t[kept])[: kept[: g.rows].sum()])
     assert columns["t_oil"] == pytest.approx(40.0 + 0.1 * (5.0 + rows)) and set(columns["p_s"]) == {18.0}
     assert columns["n_dem"] == pytest.approx(slow[np.rint(np.arange(g.rows) / 5).astype(int)])
-    bad = np.flatnonzero(~fresh)
+    bad = np.flatnonzero(gaps.far["n_r"])
     assert bad[0] == 301 and bad[-1] == 308 and len(bad) == 8  # as far as one row and a half from any sample
     assert np.flatnonzero(missing)[[0, -1]].tolist() == [300, 501] and missing.sum() == 12
+    assert np.flatnonzero(~gaps.fresh(["n_r", "vigv"])[0]).tolist() == list(range(300, 310))  # to the ends of the gap
+    assert gaps.fresh(["vigv", "x_lvdt"])[0].all()  # a gap is none of the other channels
     part = on_raster(log, g, [(0, 200), (400, 600)])
     assert part[0] == pytest.approx(rows[np.r_[0:200, 400:600]])
     for name, values in part[1].items():
         assert values == pytest.approx(columns[name][np.r_[0:200, 400:600]]), name
-    assert np.flatnonzero(~part[2]).tolist() == [199, 200]  # the border of two pieces
+    assert np.flatnonzero(part[2].border).tolist() == [199, 200]  # the border of two pieces
 
 
 def test_a_current_of_every_tick_is_its_mean_over_the_row() -> None:
@@ -145,7 +149,7 @@ def test_a_current_of_every_tick_is_its_mean_over_the_row() -> None:
     t = 0.01 * np.arange(1001)
     i = white(1, 10001)
     log = log_of(i_cmd=(ticks, i), x_lvdt=(t, np.sin(t)), n_r=(t, t))
-    rows, columns, _, _, _ = on_raster(log, grid_of(log)._replace(dt=0.01, rows=1001))
+    rows, columns, _, _ = on_raster(log, grid_of(log)._replace(dt=0.01, rows=1001))
     wanted = i[1:].reshape(-1, 10).mean(axis=1)
     assert columns["i_cmd"][1:] == pytest.approx(wanted)
     assert columns["x_lvdt"] == pytest.approx(np.sin(rows))
@@ -189,7 +193,10 @@ def test_an_rms_counts_what_is_measured_and_not_the_constants_of_windows() -> No
 def test_conditions_are_speed_direction_and_way_since_the_stroke_turned() -> None:
     t = 0.01 * np.arange(1000)
     x = 20.0 + 5.0 * np.abs((t / 2.5) % 2.0 - 1.0)  # triangles: 2 mm/s down and up
-    out, units = regimes_of(t + 3.0, {"x_lvdt": x, "n_r": 50.0 + t, "t_oil": 40.0 + 0.0 * t, "vigv": x})
+    gap = np.zeros(1000, dtype=bool)
+    none, lost = Gaps(gap, {}, {}), Gaps(gap, {"n_r": t > 9.0}, {"n_r": gap})
+    out, units = regimes_of(t + 3.0, {"x_lvdt": x, "n_r": 50.0 + t, "t_oil": 40.0 + 0.0 * t, "vigv": x}, lost)
+    assert np.isnan(out["rotor speed"]).tolist() == (t > 9.0).tolist()
     assert units == {
         "time": "s", "stroke": "mm", "stroke speed": "mm/s", "direction": "", "distance since reversal": "mm",
         "rotor speed": "%", "oil temperature": "degC",
@@ -201,7 +208,7 @@ def test_conditions_are_speed_direction_and_way_since_the_stroke_turned() -> Non
     way = out["distance since reversal"]
     assert way[240] == pytest.approx(4.8, abs=0.1) and way[490] == pytest.approx(4.8, abs=0.2)
     assert way[300] == pytest.approx(1.0, abs=0.2)
-    assert set(regimes_of(t, {"i_cmd": x, "p_s": x})[0]) == {"time", "current", "supply pressure"}
+    assert set(regimes_of(t, {"i_cmd": x, "p_s": x}, none)[0]) == {"time", "current", "supply pressure"}
 
 
 # ---- clocks ----------------------------------------------------------------------------------------------------------
@@ -210,12 +217,16 @@ def test_conditions_are_speed_direction_and_way_since_the_stroke_turned() -> Non
 def test_a_late_channel_is_put_where_it_belongs() -> None:
     late = Late(("vigv", "vgv1"), 0.02, 1e-4, 50.0)
     t = np.arange(0.0, 100.0, 10.0)
-    assert late.times(t) == pytest.approx(t - 0.02 - 1e-4 * (t - 50.0))
     assert late.text() == "vigv, vgv1: stand 20 ms late in the file, and 100 us more each second; moved"
     assert Late(("n_r",), -0.005).text() == "n_r: stand 5 ms early in the file; moved"
+    assert late.times(t) == pytest.approx(t - 0.02 - 1e-4 * (t - 50.0))
     log = log_of(7.0 + t, vigv=t, n_r=t)
-    moved = aligned(log, [late], 7.0)
+    moved = aligned(log, [late, Late(("n_r",), 0.5)], 7.0)
     assert moved["vigv"].t == pytest.approx(7.0 + late.times(t)) and moved["n_r"].t is log["n_r"].t
+    here = {"vigv": t, "n_r": 3.0 * t}
+    moved_here = driving(t, here, [late, Late(("n_r",), 0.5)])
+    assert moved_here["n_r"][:-1] == pytest.approx(3.0 * (t + 0.5)[:-1])
+    assert moved_here["vigv"] is here["vigv"] and set(moved_here) == set(here)
     assert _shifted(t, 2.0 * t, 3.0)[:5] == pytest.approx(2.0 * (t[:5] + 3.0))
 
 
@@ -583,7 +594,7 @@ def test_stages_declare_their_nominal_parameters_and_effects(chain: Chain) -> No
 
 
 def test_vanes_that_a_recorder_has_late_are_told_by_how_much(machine_log: Log, chain: Chain) -> None:
-    assert late_vanes(chain.stages) == []
+    assert late_vanes(chain.stages) == {}
     channels = dict(machine_log.channels)
     for v in VANES:
         if v in channels:
@@ -591,7 +602,7 @@ def test_vanes_that_a_recorder_has_late_are_told_by_how_much(machine_log: Log, c
             channels[v] = Channel(c.t + 0.015, c.values)
     moved = build_chain(Log("late", channels))
     (note,) = moved.notes
-    assert note.startswith("vigv, ") and "late in the file; moved" in note
+    assert note.startswith("linkage: vigv, ") and "late in the file; moved" in note
     assert float(note.split("stand ")[1].split(" ms")[0]) == pytest.approx(15.0, abs=1.0)
     assert moved.stage("linkage").floor == pytest.approx(chain.stage("linkage").floor, rel=0.15)
 

@@ -16,10 +16,12 @@ each of one of the controller's ticks, is never worked out between two of them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from hil.logs import Log
 from plant import chain
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
 from vaneloop.identification.settings import AGREES, EXPLAINED, LATE, MOVES_ALIKE, RASTER, WINDOW
@@ -27,11 +29,11 @@ from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.vane_chain.current import AS_LOGGED, LOW_PASSES, LowPass, law_of
 from vaneloop.identification.vane_chain.subsystem_data import Made
 
-__all__ = ["Late", "LateIn", "aligned", "demand_of", "late_in_controller", "late_vanes"]
+__all__ = ["Late", "LateIn", "aligned", "demand_of", "driving", "late_in_controller", "late_vanes"]
 
 Both = tuple[Array, Array]  # the mean of a row's ticks, and the last of them
 LateIn = Mapping[str, tuple["Late", ...]]  # subsystem -> what stands late in it, against what it explains
-DEMAND = ("x_dem",)
+DEMAND, DRIVING = ("x_dem",), ("n_r", "n_dem")
 LEAST_LATE = chain.TICK  # s; the controller does nothing between two ticks
 
 
@@ -55,13 +57,29 @@ class Late(NamedTuple):
         more += f", since all else has passed {self.passed.text()}" if self.passed.kind else ""
         return f"{', '.join(self.channels)}: stand {abs(1e3 * self.seconds):.3g} ms {way} in the file{more}; moved"
 
+    def times(self, t: Array) -> Array:
+        """The true times of samples that the file has at ``t`` (s)."""
+        return np.asarray(t - self.seconds - self.drift * (t - self.middle))
 
-def aligned(t: Array, columns: dict[str, Array], late: Sequence[Late]) -> dict[str, Array]:
-    """The columns of a raster where they belong."""
-    moved = {name: one for one in late for name in one.channels if name in columns}
-    return columns | {
-        name: _shifted(t, columns[name], one.seconds + one.drift * (t - one.middle)) for name, one in moved.items()
-    }
+
+def aligned(log: Log, late: Sequence[Late], start: float) -> Log:
+    """The log with its strokes and angles where they belong; ``start``: s of its own time, where that of its stages is
+    0.
+    """
+    moved = {name: one for one in late for name in one.channels if name in log.channels and name not in DRIVING}
+    channels = dict(log.channels)
+    for name, one in moved.items():
+        c = channels[name]
+        channels[name] = replace(c, t=start + one.times(c.t - start))
+    return replace(log, channels=channels) if moved else log
+
+
+def driving(t: Array, columns: dict[str, Array], late: Sequence[Late]) -> dict[str, Array]:
+    """The columns of a raster with the speeds where they belong: between their rows by straight lines, for a stage is
+    driven by them.
+    """
+    moved = {name: one for one in late for name in one.channels if name in columns and name in DRIVING}
+    return columns | {name: _shifted(t, columns[name], one.seconds) for name, one in moved.items()}
 
 
 def demand_of(late: Sequence[Late]) -> tuple[LowPass, tuple[Late, ...]]:

@@ -52,6 +52,7 @@ from vaneloop.identification.vane_chain.alignment import (
     LateIn,
     aligned,
     demand_of,
+    driving,
     late_in_controller,
     late_vanes,
 )
@@ -255,6 +256,8 @@ def _chain(
     """The stages of these ``names``, which have the same rows, and the same channels ``late``; a channel that has not
     all of its rows is left out, but for what is explained.
     """
+    behind, late = demand_of(late)
+    log = aligned(log, late, grid.start)
     cal = flashed(tables, machine)
     theirs = tables.program is not None  # a controller of the user's own: its servo's law is not known
     low, high = grid.rows_of(names[0]) if names else (0, grid.rows)
@@ -269,8 +272,7 @@ def _chain(
             f"search for missing physics"
         )
     dt = float(t[1] - t[0])
-    behind, late = demand_of(late)
-    columns = aligned(t, columns, late)
+    columns = driving(t, columns, late)
     running = np.round(columns["state"]) == RUN if "state" in columns else None
     mostly, share = True, 1.0
     if running is not None:
