@@ -136,7 +136,7 @@ def fleet(folder: Path, _: pytest.MonkeyPatch) -> None:
 
 TABLES = " ".join(f"engine/{name}.toml" for name in ("stroke_tables", "vane_angles", "geometry", "schedules"))
 CASES = {
-    "map": Case("{log}", "--out m.toml --json j.json", slow=False),
+    "map": Case("{log}", "--out m.toml --json j.json --export e.csv", slow=False),
     "replay": Case("{log}", "--out o.csv --report p.html --json j.json"),
     "compare": Case("{log}", "--out o.parquet --report p.html --json j.json"),
     "locate": Case("{log}", "--report p.html --json j.json", 1),

@@ -63,7 +63,11 @@ def levels(of: dict[int, float], monkeypatch: pytest.MonkeyPatch, width: int = 6
 def test_the_lag_doubles_until_the_noise_stops_growing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert levels({1: 1.0, 2: 1.5, 4: 1.6}, monkeypatch) == pytest.approx(1.55)  # a plateau: less than 1.08-fold
     assert levels({1: 1.0, 2: 1.5, 4: 1.65, 8: 1.65}, monkeypatch) == pytest.approx(1.65)  # none at 1.1-fold
-    assert levels({1: 1.0, 2: 2.0, 4: 4.3}, monkeypatch) == 2.0  # motion takes over: more than 2.1-fold
+    assert levels({1: 1.0, 2: 2.0, 4: 4.3, 8: 9.0}, monkeypatch) == 2.0  # motion takes over: more than 2.1-fold
+    assert levels({1: 1.0, 2: 2.0, 4: 6.1}, monkeypatch) == 2.0  # more than threefold, whatever follows
+    # up to threefold and then a plateau: noise behind a filter of the second order
+    assert levels({1: 1.0, 2: 3.0, 4: 3.1}, monkeypatch) == pytest.approx(3.05)
+    assert levels({1: 1.0, 2: 2.8, 4: 4.0, 8: 4.4}, monkeypatch) == 1.0  # none within the window
     assert levels({1: 1.0, 2: 2.1, 4: 2.1}, monkeypatch) == 2.1
     assert levels({1: 1.0, 2: 1.08, 4: 1.6, 8: 1.6}, monkeypatch) == 1.6  # 1.08-fold is none yet
     assert levels({1: 1.0, 2: 1.08, 4: 1.08}, monkeypatch) == 1.08 and figures.AGREES == AGREES == 1.1

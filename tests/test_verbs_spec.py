@@ -747,7 +747,14 @@ def test_an_experiment_is_recommended_where_rivals_are_left() -> None:
     diagnosed: Any = SimpleNamespace(diagnosis=SimpleNamespace(notes=["n"]))
     none = search.Experiment(diagnosed, None, "a.csv")
     assert none.sentence() == "Nothing to separate: the log leaves no rivals."
-    assert none.to_dict() == {"schema": 1, "log": "a.csv", "recommended": None, "profiles": [], "notes": ["n"]}
+    assert none.to_dict() == {
+        "schema": 1,
+        "log": "a.csv",
+        "recommended": None,
+        "profiles": [],
+        "notes": ["n"],
+        "done": [],
+    }
     e = {"score": 3.5, "profile": "p", "repeats": 2, "separates": ["x"], "text": "Run p.", "table": [1],
          "heads": {"nats": "nats"}, "more": 0}  # fmt: skip
     said = search.Experiment(diagnosed, e, "a.csv").to_dict()

@@ -50,7 +50,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="make a channel, such as 'lag = x_dem - x_lvdt [um]'; a later formula may name it",
     )  # fmt: skip
     group.add_argument(
-        "--between", metavar="FROM:TO", help="seconds of the log that --export writes, such as 10:20 (default: all)"
+        "--between", metavar="FROM:TO", help="seconds of the log for --export, such as 10:20 (default: all)"
     )
     group.add_argument(
         "--export", metavar="F",
