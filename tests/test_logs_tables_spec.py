@@ -119,6 +119,23 @@ def test_what_is_no_table_is_refused_by_row_and_column(tmp_path: Path, text: str
         assert said in refused(file)
 
 
+@pytest.mark.parametrize("separator", [",", ";", "\t", "|"])
+def test_cells_stand_between_commas_semicolons_tabs_or_bars(tmp_path: Path, separator: str) -> None:
+    rows = [
+        ["t", "n_dem", "remark"],
+        *([f"{k}.5", f"{50 + k}", "a|b" if separator == "," else "a,b"] for k in range(9)),
+    ]
+    log = read(csv(tmp_path, "\n".join(map(separator.join, rows)) + "\n"))
+    assert log.channels["n_dem"].values.tolist() == [50.0 + k for k in range(9)]
+    assert log.channels["n_dem"].t.tolist() == [k + 0.5 for k in range(9)]
+
+
+def test_a_time_that_is_none_is_told_what_times_are(tmp_path: Path) -> None:
+    for text in ("0 s", "00:01.5", "2026-03-01 10:00:00 CET"):
+        said = refused(csv(tmp_path, f"t,n_dem\n{text},1\n"))
+        assert f"'{text}' is not a number, nor a date such as 2026-03-01 10:00:00.000; write seconds" in said
+
+
 def test_space_behind_the_last_row_that_was_never_written_is_left_out(tmp_path: Path) -> None:
     text = b"t,n_dem\n0,50\n1,51\n2,52\n"
     for raw in (text, text + text[:9].replace(b"t,n_dem", b"3,53\n4,")):  # at the end of a row, and in one

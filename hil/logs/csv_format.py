@@ -298,7 +298,8 @@ class _Csv:
                     raise LogError(
                         f"{self.path}: row {row + self.first}: another header stands there; cut the file before it"
                     ) from None
-                raise LogError(f"{self.path}: {where}: {text[row][:40]!r} is not a number") from None
+                nor = ", nor a date such as 2026-03-01 10:00:00.000; write seconds" if key in self.times else ""
+                raise LogError(f"{self.path}: {where}: {text[row][:40]!r} is not a number{nor}") from None
         return values
 
     def _steps(self, rows: int) -> np.ndarray:

@@ -19,7 +19,7 @@ from hil.logs.units import NO_UNIT, factor_of
 
 __all__ = ["SEPARATORS", "Layout", "cells_of", "in_points", "layout_of", "line_at", "opening", "rows_of", "units_row"]
 
-SEPARATORS = ",;\t"
+SEPARATORS = ",;\t|"
 MOST_COLUMNS = 10_000
 LOOKED_AT = 60  # lines, in which the header stands
 SAMPLED = 200  # lines, whose cells say what the decimal sign is
