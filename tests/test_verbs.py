@@ -120,7 +120,7 @@ def test_an_experiment_of_a_log_without_rivals(diagnosed: Diagnosed, tmp_path: P
     assert isinstance(answer, Experiment) and answer.recommended is None
     notes = diagnosed.diagnosis.notes
     assert answer.to_dict() == {
-        "schema": 1, "log": answer.log, "recommended": None, "profiles": [], "notes": notes,
+        "schema": 1, "log": answer.log, "recommended": None, "profiles": [], "notes": notes, "done": [],
     }  # fmt: skip
     shown(answer, tmp_path)
 

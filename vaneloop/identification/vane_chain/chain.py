@@ -370,6 +370,8 @@ def _chain(
         driven = Driven(t, dict(have), machine, cal, outputs, rows, present, turns=turns)
         make = make_of[name]
         stage = make(driven)
+        if name == "demand" and pieces:  # how much of the input's noise is an error, is told from a whole log
+            stage.lost = stage.raster_error = None
         stage.regimes, stage.regime_units = regimes, units
         if np.isfinite(stage.measured).sum() < 300:
             absent[name] = "fewer than 300 samples in mode RUN without gaps"
