@@ -342,17 +342,19 @@ class Session:
             self.made = made[0]
             for o, channels, more in zip(overlays, logs[1:], made[1:], strict=True):
                 o.shown = {**channels, **{n: c for n, c in more.items() if isinstance(c, Channel)}}
-            for key in [k for k in self.saved if k.startswith("between-")]:
-                del self.saved[key]  # of other channels
+            self._drop_exports()
             self._draw_log()
         self.touch("log", "formula", "over")
 
     def set_cursors(self, first: float | None, second: float | None) -> None:
         """Where the cursors of the log's curves are now, s."""
         self.cursors = first, second
-        for key in [k for k in self.saved if k.startswith("between-")]:
-            del self.saved[key]  # of another part
+        self._drop_exports()
         self.touch("cursors")
+
+    def _drop_exports(self) -> None:
+        """Offer no file of channels that was written of other channels or of another part."""
+        self.saved = {k: v for k, v in self.saved.items() if not k.startswith("between-")}
 
     def between(self) -> tuple[float, float] | None:
         """The part of the log between both cursors, s; None where there are not two."""

@@ -41,7 +41,7 @@ class Late(NamedTuple):
     """Channels whose samples stand ``seconds`` late in the file at the middle of the log, and ``drift`` (s/s) more with
     each second; times count from the start of the log's stages.
 
-    passed  of the servo's demand: what all else has passed, which makes the delay or a part of it
+    passed  low-pass of the analogue channels that the servo's demand has not passed: it makes the delay, or part of it
     """
 
     channels: tuple[str, ...]
@@ -54,7 +54,7 @@ class Late(NamedTuple):
         """What is said of it."""
         way = "late" if self.seconds >= 0.0 else "early"
         more = f", and {1e6 * self.drift:.3g} us more each second" if self.drift else ""
-        more += f", since all else has passed {self.passed.text()}" if self.passed.kind else ""
+        more += f", because the analogue channels have passed {self.passed.text()}" if self.passed.kind else ""
         return f"{', '.join(self.channels)}: stand {abs(1e3 * self.seconds):.3g} ms {way} in the file{more}; moved"
 
     def times(self, t: Array) -> Array:
@@ -83,7 +83,7 @@ def driving(t: Array, columns: dict[str, Array], late: Sequence[Late]) -> dict[s
 
 
 def demand_of(late: Sequence[Late]) -> tuple[LowPass, tuple[Late, ...]]:
-    """What the servo's demand has not passed and its answer has, and what else stands late."""
+    """The low-pass that stroke and current have passed and the servo's demand has not; and all other offsets."""
     behind = next((one.passed for one in late if one.channels == DEMAND), AS_LOGGED)
     return behind, tuple(one for one in late if one.channels != DEMAND)
 

@@ -146,8 +146,8 @@ def build_chain(
     pieces   rows of it, as `on_raster` takes them: the stages of these only
     draws    of what the log hides from the servo
     """
-    chain = _build(log, plant, calibration, present, grid, pieces, draws)
     late: dict[str, tuple[Late, ...]] = {}
+    chain = _build(log, plant, calibration, present, grid, pieces, draws, late)
     framed = any(c.framed for c in log.channels.values())  # frames are stamped by one clock
     for find in () if pieces or framed else (late_in_controller, late_vanes):
         if found := find(chain.stages):
@@ -174,7 +174,7 @@ def _build(
     grid: Grid | None,
     pieces: Sequence[tuple[int, int]],
     draws: int,
-    late: LateIn = {},  # noqa: B006
+    late: LateIn,
 ) -> Chain:
     """`build_chain` with every channel where the file has it, but for what stands ``late`` in a subsystem."""
     machine = plant or build_plant()
@@ -367,11 +367,11 @@ def _chain(
         own = _rows(t, gaps, _used(name), running, mostly)
         rows = own.law_holds if name in ("servo", "demand") else own.currents if name == "actuator" else own.machine
         have |= own.columns()
-        driven = Driven(t, dict(have), machine, cal, outputs, rows, present, turns=turns)
+        # how much of the rotor speed's noise is an error of the demand, only a whole log tells
+        told = name == "demand" and bool(pieces)
+        driven = Driven(t, dict(have), machine, cal, outputs, rows, present, turns=turns, again=told)
         make = make_of[name]
         stage = make(driven)
-        if name == "demand" and pieces:  # how much of the input's noise is an error, is told from a whole log
-            stage.lost = stage.raster_error = None
         stage.regimes, stage.regime_units = regimes, units
         if np.isfinite(stage.measured).sum() < 300:
             absent[name] = "fewer than 300 samples in mode RUN without gaps"
@@ -391,7 +391,7 @@ def _chain(
             slow = [c for c in needs if log.channels[c].apart > 1.5 * dt]
             # what half of the true samples cost, or half the time between two, is more than what the lines do
             for other in ({c: np.interp(t, t[true], have[c][true]) for c in slow}, {c: have[c][half] for c in slow}):
-                varied = make(driven._replace(columns=have | other))
+                varied = make(driven._replace(columns=have | other, again=True))
                 change = stage.run(stage.neutral()[None])[0] - varied.run(varied.neutral()[None])[0]
                 more = np.maximum(more, rms(stage, change))
             stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)

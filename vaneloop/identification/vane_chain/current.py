@@ -112,7 +112,8 @@ def servo_law(
     At the row it has the logged stroke with its noise; the nine ticks before it had other noise, so theirs is taken off
     the stroke.
 
-    behind  what stroke and current have passed, and the demand has not: a filter of both is one of the law
+    behind  the low-pass that stroke and current have passed and the demand has not. The law is linear: with the demand
+            behind the same low-pass it holds for what was logged
 
     Returns the current (mA) of the ten ticks since the row before, the last at the row, float64[rows, 10]; and draws of
     how much their mean, and that of the ticks that `samples_of` gives for ``samples``, are off because not all of

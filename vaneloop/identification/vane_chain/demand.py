@@ -116,7 +116,7 @@ def demand_stage(driven: Driven) -> Stage:
     def value(theta: Array, name: str, neutral: float) -> float:
         return float(theta[at[name]]) if name in at else neutral
 
-    def simulate(thetas: Array) -> Array:
+    def simulate(thetas: Array, n_r: Array = n_r, signals: Array = signals) -> Array:
         out = np.empty((len(thetas), 1, len(t)))
         other = np.empty(len(t))
         shift = next(bends(driven, thetas, signals, DEMAND_ADDS)) * 1e-3 if driven.curved else none
@@ -162,21 +162,31 @@ def demand_stage(driven: Driven) -> Stage:
     stage.made = Made(demand_stage, driven)
     if driven.again:
         return stage
-    as_logged, own = simulate(stage.neutral()[None])[0, 0], []
-    for seed in range(CURRENT_DRAWS):
-        noisy = demand_stage(driven._replace(columns=c | {"n_r": n_r + _other_noise(t, n_r, seed)}, again=True))
-        own.append(np.where(np.isfinite(measured), noisy.run(noisy.neutral()[None])[0, 0] - as_logged, np.nan))
-    share, beyond = _by_noise(t, measured - as_logged, np.array(own), LEAST_FLOOR["demand"])
-    stage.lost, stage.raster_error = np.sqrt(share) * np.array(own)[:, None], np.array([beyond])
+    neutral = stage.neutral()[None]
+    as_logged, draws = simulate(neutral)[0, 0], []
+    for noise in _other_noise(t, n_r, CURRENT_DRAWS):
+        other = n_r + noise
+        run_of_it = simulate(neutral, other, driven._replace(columns=c | {"n_r": other}).signals())[0, 0]
+        draws.append(np.where(np.isfinite(measured), run_of_it - as_logged, np.nan))
+    by_noise = np.array(draws)
+    share, beyond = _by_noise(t, measured - as_logged, by_noise, LEAST_FLOOR["demand"])
+    stage.lost, stage.raster_error = np.sqrt(share) * by_noise[:, None], np.array([beyond])
     return stage
 
 
-def _other_noise(t: Array, values: Array, seed: int) -> Array:
-    """Noise such as a channel has: white, and what its last digit hides, which is one error as long as it stands."""
-    draw, step, size = np.random.default_rng(seed), resolution(values), noise_floor(t, values)
-    hidden = step * draw.uniform(-0.5, 0.5, len(t))[np.cumsum(np.diff(values, prepend=values[0]) != 0.0)]
+def _other_noise(t: Array, values: Array, draws: int) -> list[Array]:
+    """Draws of noise such as a channel has: white, and the rounding of its last digit, which stays the same as long as
+    the value does.
+    """
+    step, size = resolution(values), noise_floor(t, values)
+    stands = np.cumsum(np.diff(values, prepend=values[0]) != 0.0)
     white = max(size**2 - step**2 / 12.0, 0.0)
-    return np.asarray(hidden + np.sqrt(white if white > 0.05 * size**2 else 0.0) * draw.standard_normal(len(t)))
+    white = np.sqrt(white if white > 0.05 * size**2 else 0.0)
+    out = []
+    for seed in range(draws):
+        draw = np.random.default_rng(seed)
+        out.append(step * draw.uniform(-0.5, 0.5, len(t))[stands] + white * draw.standard_normal(len(t)))
+    return out
 
 
 def _by_noise(t: Array, error: Array, draws: Array, least: float) -> tuple[float, float]:

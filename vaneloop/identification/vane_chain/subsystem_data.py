@@ -38,7 +38,8 @@ class Driven(NamedTuple):
     curves               what may be tried besides: curves as they run, and as the search has them
     turns                what follows from the whole stroke (`ground.reversals`), worked out when it is asked for
     part_of              of an excerpt: the whole, and which of its rows these are
-    again                whether the stage has been made of this log before: its noise is taken over from there
+    again                whether the stage takes its noise over, as one does that was made of this log before: it is not
+                         estimated
     """
 
     t: Array
