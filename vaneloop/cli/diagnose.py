@@ -11,7 +11,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.cli import explain, options, own_model
 from vaneloop.cli.chains import chain_of
 from vaneloop.cli.options import add_machine_options
-from vaneloop.pages.story import CANNOT, UNKNOWN, doubt, sizes, word
+from vaneloop.pages.story import CANNOT, UNKNOWN, doubt, since, sizes, word
 from vaneloop.verbs.search import diagnosed, not_given
 
 __all__ = ["DESCRIPTION", "add_options", "command", "show"]
@@ -87,8 +87,8 @@ def show(args: argparse.Namespace, answer: Any) -> None:
     options.say_tested(args, answer.tested)
     for s in d.stages:
         for f in s.effects:
-            unsure = f"; {doubt(f)}" if doubt(f) else ""
-            terminal.say(args, f"missing in {s.stage}: {f.effect} ({100 * f.probability:.0f} %): {sizes(f)}{unsure}")
+            more = "".join(f"; {said}" for said in (since(s), doubt(f)) if said)
+            terminal.say(args, f"missing in {s.stage}: {f.effect} ({100 * f.probability:.0f} %): {sizes(f)}{more}")
         for x in d.shapes.get(s.stage, []):
             terminal.say(args, f"{UNKNOWN if s.verdict == 'unknown' else 'left'} in {s.stage}: {x.text}")
         if s.verdict == "unknown" and (s.nearest or s.refused):

@@ -12,7 +12,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.files import check
 from vaneloop.cli import options, own_model
 from vaneloop.cli.chains import chain_of
-from vaneloop.pages.story import falling, floors, sizes, word
+from vaneloop.pages.story import falling, floors, since, sizes, word
 from vaneloop.verbs.machine import with_law_files
 from vaneloop.verbs.search import extended, known
 
@@ -82,7 +82,7 @@ def command(args: argparse.Namespace) -> int:
     options.say_tested(args, answer.tested)
     for r in results:
         for f in r.effects:
-            terminal.say(args, f"{f.effect}: {sizes(f)}")
+            terminal.say(args, "; ".join(filter(None, (f"{f.effect}: {sizes(f)}", since(r)))))
         terminal.say(
             args, f"{r.stage}, in noise floors: " + " -> ".join(f"{name} {floors(level)}" for name, level in falling(r))
         )

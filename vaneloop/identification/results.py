@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
+from vaneloop.identification.onset import Onset
 from vaneloop.identification.selection.calibration import trust
 from vaneloop.identification.selection.rules import Decision
 from vaneloop.identification.settings import NINETY
@@ -88,6 +89,7 @@ class StageDiagnosis:
     criterion: str = ""  # what an effect had to do to be named: `identification.selection.calibration.COEFFICIENTS`
     notes: list[str] = field(default_factory=list)  # what decided between rivals, what was left out, in words
     decisions: list[Decision] = field(default_factory=list, repr=False)  # every acceptance rule's verdict
+    onset: Onset | None = None  # when the effects begin; None: they act all along
 
 
 def rms_of(judge: LeastSquaresProblem, fit: Fit) -> float:

@@ -245,6 +245,15 @@ STRAY_RANGE = setting(
 
 # ---- Selection ------------------------------------------------------------------------------------------------------
 under("Selection")
+ONSET_BLOCKS = setting(
+    2,
+    "blocks",
+    "Effects begin within a log where so many blocks before it are at the noise; so many lie behind it.",
+    "principle: a gain is no gain where a single block has it",
+)
+ONSET_ROUNDS = setting(
+    4, "searches", "The time at which effects begin is found in at most so many searches.", "budget of work"
+)
 NATS = setting(
     12.0,
     "log-likelihood",

@@ -6,7 +6,7 @@ import multiprocessing
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, wait
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from vaneloop.base.side_by_side import forks, in_processes
 from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
+from vaneloop.identification.onset import beginning_at, onset_of
 from vaneloop.identification.regimes import Located, Shape, StageFigures, agrees, locate, shape
 from vaneloop.identification.results import StageDiagnosis, parameters_of, recalibrated, rms_of, rms_per_output, weigh
 from vaneloop.identification.selection.diagnosis import Judged, diagnose_stage, extend_stage, floor_of
@@ -299,6 +300,8 @@ def _fits(
     judge = LeastSquaresProblem(stage, other.floor)
     start = other.final.theta.copy()
     start[theirs] = size
+    if not other.final.effects:  # from when on it acts is the machine's, too
+        start = beginning_at(stage, start, onset_of(stages[d.stage], fit.theta))
     held = judge.fit(tuple(e for e in other.final.effects if e != effect), start, 6)
     return not significant(judge, held, other.final, correlation_of(judge, other.final))
 
@@ -344,6 +347,7 @@ def diagnosis_json(d: Diagnosis, log: str) -> dict[str, Any]:
                     "effect": f.effect, "stage": s.stage, "probability": f.probability, "parameters": f.parameters,
                     "rivals": f.rivals,
                     "inseparable": f.inseparable, "probabilities": f.probabilities, "evidence": f.evidence,
+                    **({"onset_s": asdict(s.onset)} if s.onset else {}),
                 }
             )  # fmt: skip
         recalibrated += s.recalibrated

@@ -32,6 +32,7 @@ from vaneloop.pages.story import (
     floors,
     jumps,
     reached,
+    since,
     stage_tone,
     untold,
     word,
@@ -67,7 +68,7 @@ def verdict_sentence(d: Diagnosis, by_log: ByLog | None = None) -> str:
     for s in d.stages:
         if s.verdict == "missing":
             names = [f"{f.effect}" + (f" (or {', '.join(f.rivals)})" if f.rivals else "") for f in s.effects]
-            parts.append(f"the {s.stage} subsystem lacks {' and '.join(names)}")
+            parts.append(f"the {s.stage} subsystem lacks {' and '.join(names)} {since(s)}".rstrip())
         elif s.verdict == "unknown":
             first = [x for x in d.shapes.get(s.stage, []) if x.explained >= SHAPE_TOLD]
             what = f": {first[0].text}" if first else ""
@@ -295,6 +296,9 @@ def _told(
             ],
             rows,
         )
+    for s in d.stages:
+        if s.effects and s.onset is not None:
+            page.text(f"{capital(s.stage)}: {' and '.join(f.effect for f in s.effects)} {since(s)}, not before.")
     if by_log is not None:
         log_by_log(page, by_log)
         curves_by_log(page, by_log)

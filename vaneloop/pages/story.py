@@ -101,6 +101,14 @@ def sizes(f: Found) -> str:
     return ", ".join(sized(name, p) for name, p in f.parameters.items())
 
 
+def since(s: StageDiagnosis) -> str:
+    """From when on a stage's effects act, with its interval; "": all along."""
+    if s.onset is None:
+        return ""
+    value, low, high = interval(s.onset.value, s.onset.low, s.onset.high)
+    return f"from {value} s on [{low}, {high}]"
+
+
 def doubt(f: Found) -> str:
     """What this log cannot tell about an effect; "": nothing."""
     out = []
@@ -118,7 +126,7 @@ def extended_sentence(d: Diagnosis, refused: str = "") -> str:
     parts = []
     for s in d.stages:
         _, before, after = fall(s)
-        names = " and ".join(f.effect for f in s.effects) or "the nominal model"
+        names = " ".join([" and ".join(f.effect for f in s.effects) or "the nominal model", since(s)]).strip()
         end = EXPLAINED if reached(s) else "an error remains"
         parts.append(f"with {names} the error of {together(s)} falls from {before} to {after} noise floors: {end}")
     text = "; ".join(parts) or "nothing was extended"

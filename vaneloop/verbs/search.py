@@ -23,6 +23,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.signals import heading
 from vaneloop.identification import Record, StageError, System
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.onset import Onset
 from vaneloop.identification.regimes import Located
 from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance
 from vaneloop.identification.user_models.by_log import ByLog, as_given, bind
@@ -48,7 +49,7 @@ from vaneloop.pages.diagnosis import (
     located_sentence,
     verdict_sentence,
 )
-from vaneloop.pages.story import CANNOT, EXPLAINED, MISSING, extended_sentence, reached
+from vaneloop.pages.story import CANNOT, EXPLAINED, MISSING, extended_sentence, reached, since
 from vaneloop.verbs.answer import COLOUR, Answer, Row, axes, labelled
 from vaneloop.verbs.curves import Curves, curves_of_logs
 from vaneloop.verbs.estimates import Fitted
@@ -584,7 +585,15 @@ def diagnosed(
     else:
         chain, d, held = searched(chain, workers, progress, news)
     d.notes = [*chain.notes, *(map(str, held.failing) if held else ()), *_at_limit(d.stages)]
+    _in_time_of_log(d.stages, chain)
     return Diagnosed(chain, d, log, held=held)
+
+
+def _in_time_of_log(stages: Sequence[StageDiagnosis], chain: Chain) -> None:
+    """Tell onsets in the log's own time; a chain's begins at 0."""
+    for s in stages:
+        if s.onset is not None:
+            s.onset = Onset(*(v + chain.start for v in (s.onset.value, s.onset.low, s.onset.high)))
 
 
 def _at_limit(stages: Sequence[StageDiagnosis]) -> list[str]:
@@ -730,6 +739,8 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
     if chain.whole is not None:
         results, held = held_results(bound, results)
     notes = [*chain.notes, *(map(str, held.failing) if held else ()), *_at_limit(results)]
+    _in_time_of_log(results, chain)
+    notes += [f"{r.stage}: effects {since(r)}; the model has them all along" for r in results if r.onset is not None]
     d = Diagnosis("missing", results, {}, chain.not_observed, seconds, notes)
     return Extended(bound, d, log, None, model, next(filter(None, map(no_better, results)), ""), held=held)
 

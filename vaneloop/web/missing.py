@@ -25,6 +25,7 @@ from vaneloop.pages.story import (
     floors,
     jumps,
     reached,
+    since,
     sizes,
     together,
     worths,
@@ -341,7 +342,9 @@ class _Page:
         if name in found:
             f = found[name]
             text = f"{100 * f.probability:.0f} %: {sizes(f)}"
-            return ". ".join(part for part in (text, capital(doubt(f)), summary) if part)
+            d = self.s.stage_diagnosis()
+            when = "" if d is None else since(d)
+            return ". ".join(part for part in (text, capital(when), capital(doubt(f)), summary) if part)
         if name in named:
             return f"Rival of {named[name]}: this log cannot distinguish them. {summary}"
         if c is not None and c.reason:

@@ -14,13 +14,24 @@ from functools import partial
 
 import numpy as np
 
+from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
+from vaneloop.identification.onset import beginning_at, begun, change_point, onset_of, quiet_until
+from vaneloop.identification.regimes import agrees
 from vaneloop.identification.results import Candidate, StageDiagnosis, answer_of, found_of, rms_of
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
+from vaneloop.identification.selection.rules import BEGINS, Beginning, Decisions
 from vaneloop.identification.selection.search import Criterion, Search
 from vaneloop.identification.selection.stepwise import eliminate, stepwise
 from vaneloop.identification.selection.subsampled_search import excerpt_of, searched
-from vaneloop.identification.settings import EXCERPT_PIECE, EXCERPT_SAMPLES, LONG_SAMPLES, PAIR_LEADERS, TOLERATED
+from vaneloop.identification.settings import (
+    EXCERPT_PIECE,
+    EXCERPT_SAMPLES,
+    LONG_SAMPLES,
+    ONSET_ROUNDS,
+    PAIR_LEADERS,
+    TOLERATED,
+)
 from vaneloop.identification.subsystem import Array, Stage, StageError, noise_of, reach_of
 
 __all__ = ["Judged", "diagnose_stage", "extend_stage", "floor_of"]
@@ -56,7 +67,8 @@ def diagnose_stage(
     second excerpt is taken from what is left.
     """
     if stage.excerpt is None or len(stage.t) < LONG_SAMPLES:
-        return _unless_coarse(stage, _to_the_floor(stage, floor, keep, tick, judged))
+        said = _whenever(stage, keep, judged, lambda later: _to_the_floor(later, floor, keep, tick, judged))
+        return _unless_coarse(stage, said)
     judge = LeastSquaresProblem(stage, floor, keep)
     at = excerpt_of(judge, None, EXCERPT_PIECE, EXCERPT_SAMPLES)
     even = LeastSquaresProblem(stage.excerpt(at), floor, None if keep is None else keep[..., at])
@@ -65,7 +77,8 @@ def diagnose_stage(
     for _ in range(2):
         at = excerpt_of(judge, left, EXCERPT_PIECE, EXCERPT_SAMPLES)
         part = stage.excerpt(at)
-        said = _to_the_floor(part, floor, None if keep is None else keep[..., at], tick, judged)
+        own = None if keep is None else keep[..., at]
+        said = _whenever(part, own, judged, partial(_to_the_floor, floor=floor, keep=own, tick=tick, judged=judged))
         found = _confirm(stage, keep, floor, base, said, judged)
         if found.verdict != "unknown" or said.verdict == "unknown":
             break
@@ -89,8 +102,12 @@ def _confirm(
     criterion = judged(judge)
     nominal = base if np.array_equal(floor, said.floor) else judge.fit((), base.theta, 4)
     chosen, current = said.final.effects, nominal
+    begins = onset_of(stage, said.final.theta)
     if chosen:
-        current = judge.fit(chosen, said.final.theta, 8)
+        start = said.final.theta
+        if begins is not None:
+            start = beginning_at(stage, start, change_point(judge, said.final, said.correlation).value)
+        current = judge.fit(chosen, start, 8)
         if judge.total_of(current) > judge.total_of(nominal):  # what suits the excerpt may suit nothing else
             current = judge.fit(chosen, nominal.theta, 8)
     criterion.learn(current)
@@ -118,7 +135,10 @@ def _confirm(
     steps = [("nominal", rms_of(judge, nominal))]
     if chosen:
         steps.append((" + ".join(chosen), rms_of(judge, current)))
-    return criterion.conclude(nominal, current, effects, said.candidates, steps)
+    out = criterion.conclude(nominal, current, effects, said.candidates, steps)
+    if current.effects and onset_of(stage, current.theta) is not None:
+        out.onset = change_point(judge, current, correlation_of(judge, current))
+    return out
 
 
 def _allowed(stage: Stage, effects: tuple[str, ...]) -> Array:
@@ -170,6 +190,37 @@ def _to_the_floor(
             f"from the best parameters of the search"
         )
     return d
+
+
+def _whenever(
+    stage: Stage, keep: Array | None, judged: Judged, ask: Callable[[Stage], StageDiagnosis]
+) -> StageDiagnosis:
+    """What ``ask`` says of effects that act all along; where these leave more than noise, and the model without effects
+    does not up to some time, what it says of effects that begin then.
+    """
+    said = ask(stage)
+    if not said.final.effects and said.verdict != "unknown" or said.final.effects and agrees(said.excess, 1.0):
+        return said
+    at = quiet_until(LeastSquaresProblem(stage, said.floor, keep), lambda part, fit: judged(part).fails(fit))
+    for _ in range(ONSET_ROUNDS):
+        if at is None:
+            break
+        found = ask(begun(stage, at))
+        if not found.final.effects:
+            break
+        judge = LeastSquaresProblem(stage, found.floor, keep)
+        correlation = correlation_of(judge, found.final)
+        when = change_point(judge, found.final, correlation)
+        if found.verdict == "missing" and when.low <= at <= when.high:
+            thetas = np.array([said.final.theta, found.final.theta])
+            always, later = judge.totals(judge.errors(thetas), thetas)
+            case = Beginning(0.5 * float(always - later) / correlation, judge.n_blocks)
+            decisions = Decisions(found.decisions)
+            if decisions.decide([BEGINS], case, found.final.effects, said.final.effects):
+                return replace(found, onset=when, decisions=list(decisions))
+            break
+        at = when.value
+    return said
 
 
 def _search(search: Search) -> Said:
@@ -304,6 +355,14 @@ def extend_stage(
             raise StageError(
                 f"subsystem {stage.name!r} has no effect {e!r}; it has {', '.join(x.name for x in stage.effects)}"
             )
+
+    return _whenever(stage, None, judged, lambda later: _extended(later, effects, tick, judged))
+
+
+def _extended(
+    stage: Stage, effects: tuple[str, ...], tick: Callable[[], None] | None, judged: Judged
+) -> StageDiagnosis:
+    """`extend_stage` with effects that act all along, or from the stage's onset on."""
 
     def ask(floor: Array, _: bool) -> tuple[Fit, Said]:
         judge = LeastSquaresProblem(stage, floor)

@@ -9,6 +9,7 @@ A number that is not finite never meets a limit.
 | `KNOWN_NOISE` | effects and curves of a model that may come down to the noise of its log | `Comparison` |
 | `UNKNOWN_NOISE` | effects and curves of a model that will not | `Comparison` |
 | `AWAY` | effects of the library, on top of these | `Comparison` |
+| `BEGINS` | effects that begin within the log, against those that act all along | `Beginning` |
 | `NEAR_NOISE` | curves where the error is hardly more than noise | `AllRows` |
 | `DISSIPATES`, `CONFIRMED` | curves of hysteretic and dynamic terms | a number, `Confirmation` |
 | `OTHER_LOGS` | what was accepted, on each log | `LogChanges` |
@@ -53,10 +54,10 @@ from vaneloop.identification.settings import (
 from vaneloop.identification.subsystem import Array
 
 __all__ = [
-    "AWAY", "CONFIRMED", "DISSIPATES", "EXCESS", "EXPLAINS_HALF", "GAIN", "HARMS_NONE", "KNOWN_NOISE",
+    "AWAY", "BEGINS", "CONFIRMED", "DISSIPATES", "EXCESS", "EXPLAINS_HALF", "GAIN", "HARMS_NONE", "KNOWN_NOISE",
     "LEAVES_A_QUARTER", "LEAVES_LITTLE", "NAMED", "NEAR_NOISE", "OTHER_LOGS", "RULES", "SUITS_ALL", "UNKNOWN_NOISE",
-    "AllRows", "Comparison", "Confirmation", "Decision", "Decisions", "LogChanges", "Naming", "Remainder", "Rule",
-    "Verdict", "decisions_json", "gain",
+    "AllRows", "Beginning", "Comparison", "Confirmation", "Decision", "Decisions", "LogChanges", "Naming", "Remainder",
+    "Rule", "Verdict", "decisions_json", "gain",
 ]  # fmt: skip
 
 Case = TypeVar("Case")
@@ -268,6 +269,25 @@ AWAY = Rule[Comparison](
     "away from neutral", "interval half-widths",
     "An effect whose own interval holds the size at which it does nothing is not there.",
     lambda c: c.away_from_neutral, lambda _: 1.0,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """Effects that begin within a log held against the best that act all along.
+
+    nats   gain of log-likelihood
+    times  blocks of the log, in each of which they might have begun
+    """
+
+    nats: float
+    times: int
+
+
+BEGINS = Rule[Beginning](
+    "gain by an onset", "1",
+    "Effects may begin in any block of the log: the best of n times gains the logarithm of n by chance.",
+    lambda c: c.nats, lambda c: NATS + float(np.log(c.times)),
 )  # fmt: skip
 
 UNKNOWN_NOISE = (
@@ -509,7 +529,7 @@ LEAVES_A_QUARTER = Rule[Remainder](
 RULES: dict[str, Rule[Any]] = {
     rule.name: rule
     for rule in (
-        *KNOWN_NOISE, *UNKNOWN_NOISE, AWAY, *NEAR_NOISE, DISSIPATES, CONFIRMED, *OTHER_LOGS, SUITS_ALL, *NAMED,
+        *KNOWN_NOISE, *UNKNOWN_NOISE, AWAY, BEGINS, *NEAR_NOISE, DISSIPATES, CONFIRMED, *OTHER_LOGS, SUITS_ALL, *NAMED,
         EXPLAINS_HALF, *LEAVES_LITTLE, LEAVES_A_QUARTER,
     )
 }  # fmt: skip

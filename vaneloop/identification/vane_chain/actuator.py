@@ -8,6 +8,7 @@ from plant import chain, places
 from plant.effects import oil_compressibility, piston_stiction
 from plant.parameters import derive
 from plant.stages import actuator_run, step_currents
+from vaneloop.identification.onset import that_begins
 from vaneloop.identification.settings import NEAR_STOP, RASTER, SIMPLER, SUBSTEPS, WINDOW
 from vaneloop.identification.subsystem import Array, Named, Stage, without_jumps
 from vaneloop.identification.vane_chain.parameters import declared, lanes, like_time
@@ -17,6 +18,7 @@ from vaneloop.identification.vane_chain.subsystem_data import Driven, Made, exce
 __all__ = ["actuator_stage"]
 
 
+@that_begins
 def actuator_stage(driven: Driven) -> Stage:
     """Stroke from the current of every tick, started anew in each window."""
     t, c, machine, _, outputs, run = driven[:6]

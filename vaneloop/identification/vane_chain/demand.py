@@ -13,6 +13,7 @@ from hil.native.call import firmware
 from plant.curve import DEMAND_ADDS
 from plant.effects import ROW
 from vaneloop.base.compiled import compiled, compiled_free
+from vaneloop.identification.onset import that_begins
 from vaneloop.identification.settings import APPROACH, CURRENT_DRAWS, DEMAND_SAME, LEAST_FLOOR, RASTER, WARM_FRAMES
 from vaneloop.identification.subsystem import Array, Effect, Parameter, Stage
 from vaneloop.identification.vane_chain.parameters import bends, declared
@@ -97,6 +98,7 @@ def _direction_known(n_dem: Array, cal: Calibration) -> Array:
     return known & ~lately(~known, cal.scalars.blend_time + 0.1)
 
 
+@that_begins
 def demand_stage(driven: Driven) -> Stage:
     """Stroke demand from logged speeds, by the firmware as it is flashed."""
     t, c, machine, cal, outputs, run = driven[:6]
@@ -247,6 +249,7 @@ def _run(
                 out[i] = given.x_dem
 
 
+@that_begins
 def own_demand_stage(driven: Driven) -> Stage:
     """Stroke demand from logged speeds, by the user's library as it is flashed.
 

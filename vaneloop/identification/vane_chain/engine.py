@@ -6,6 +6,7 @@ import numpy as np
 
 from plant import chain, places
 from plant.stages import engine_run
+from vaneloop.identification.onset import that_begins
 from vaneloop.identification.settings import RASTER
 from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.vane_chain.parameters import declared, lanes
@@ -15,6 +16,7 @@ from vaneloop.identification.vane_chain.subsystem_data import Driven, Made
 __all__ = ["engine_stage"]
 
 
+@that_begins
 def engine_stage(driven: Driven) -> Stage:
     """Rotor speed from its demand; the speed at the start of each stretch is what suits its first second."""
     t, c, machine, _, outputs, run = driven[:6]

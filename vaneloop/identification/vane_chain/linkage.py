@@ -7,6 +7,7 @@ import numpy as np
 from plant.parameters import derive
 from plant.stages import linkage_run
 from plant.stages.linkage import speed_reach
+from vaneloop.identification.onset import that_begins
 from vaneloop.identification.settings import SETTLE, WINDOW
 from vaneloop.identification.subsystem import Array, Named, Stage
 from vaneloop.identification.vane_chain.parameters import declared, lanes, like_temperature, like_time
@@ -16,6 +17,7 @@ from vaneloop.identification.vane_chain.subsystem_data import Driven, Made, exce
 __all__ = ["linkage_stage"]
 
 
+@that_begins
 def linkage_stage(driven: Driven) -> Stage:
     """Vane angles that the log has, from the stroke."""
     t, c, machine, _, outputs, run = driven[:6]

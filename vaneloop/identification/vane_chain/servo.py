@@ -6,6 +6,7 @@ import numpy as np
 
 from hil.figures import noise_floor
 from plant.curve import QUANTITIES, SERVO_ADDS, SERVO_TIMES
+from vaneloop.identification.onset import that_begins
 from vaneloop.identification.settings import NOISE_KNOWN_TO, WINDOW
 from vaneloop.identification.subsystem import Array, Stage, without_jumps
 from vaneloop.identification.vane_chain.parameters import bends, declared
@@ -15,6 +16,7 @@ from vaneloop.identification.vane_chain.subsystem_data import Driven, Made
 __all__ = ["servo_stage"]
 
 
+@that_begins
 def servo_stage(driven: Driven) -> Stage:
     """Current from logged demand and stroke, by the firmware's law."""
     t, c, _, cal, outputs, run = driven[:6]
