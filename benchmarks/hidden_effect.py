@@ -64,6 +64,7 @@ examples:
   python -m benchmarks.hidden_effect --logs 60 --kinds outside clean --learn --out out/learned.parquet
   python -m benchmarks.hidden_effect --logs 40 --leave-out --out out/left_out.parquet
   python -m benchmarks.hidden_effect --logs 40 --loggers --out out/loggers.parquet
+  python -m benchmarks.hidden_effect --logs 40 --begins --kinds single pair --out out/begins.parquet
   python -m benchmarks.hidden_effect --plant tables/plant_electromechanical.toml --out out/motor.parquet
 
 exit codes: 0 done, 2 bad input. The figures are for reading; no threshold decides."""
@@ -73,6 +74,8 @@ GAPS = 0.2  # of the logs lack rows
 MODES = 0.2  # of the logs have seconds in another mode
 MACHINES = {"hydraulic": "plant.toml", "electromechanical": "plant_electromechanical.toml"}  # that the rig has
 LEAVE_OUT = "left out"  # a kind of its own
+IN_CONTROLLER = ("trend_threshold_error",)  # the rig's controller has it from the start or not at all
+ONSET_NEAR = 2.0  # s, by which an onset may be off
 LIKELY = 0.5  # a name less probable than this needs a rival
 
 
@@ -86,6 +89,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--loggers",
         action="store_true",
         help="every log is taken by an ordinary recorder of its own: rate, filter, clocks, last digit, hum, stale rows",
+    )
+    parser.add_argument(
+        "--begins",
+        action="store_true",
+        help="what is hidden begins within the log, at a time drawn from its middle: is that found, too?",
     )
     parser.add_argument(
         "--experiments",
@@ -105,7 +113,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def draw_case(
     seed: int, index: int, duration: float = 300.0, machine: str = "hydraulic", kinds: Sequence[str] = KINDS,
-    leave_out: bool = False,
+    leave_out: bool = False, begins: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Draw what is hidden in log ``index`` of the series ``seed``: kind, effects, links, gaps and modes, nothing
     simulated yet.
@@ -113,9 +121,10 @@ def draw_case(
     machine  of `MACHINES`: what can be hidden in it
     kinds    of `KINDS`, that are drawn
     leave_out  hide effects that can be left out of the library instead
+    begins     what is hidden acts from a time on that is drawn, too
     """
     motor = machine == "electromechanical"
-    library = list(rig.WITH_MOTOR if motor else rig.EFFECTS)
+    library = [e for e in (rig.WITH_MOTOR if motor else rig.EFFECTS) if not (begins and e in IN_CONTROLLER)]
     outside = [k for k, e in rig.OUTSIDE.items() if not motor or e.stage != "actuator" or e.site == "lvdt"]
     rng = np.random.default_rng([seed, index])
     shares = np.array([share if kind in kinds else 0.0 for kind, share in zip(KINDS, SHARES, strict=True)])
@@ -147,6 +156,9 @@ def draw_case(
                 kind_of, round(float(rng.uniform(0.2, 0.8) * duration), 2), round(float(rng.uniform(1.0, longest)), 2)
             )
         ]
+    if begins:
+        onset = round(float(rng.uniform(0.3, 0.7) * duration), 2)
+        hidden = [replace(h, onset=onset) for h in hidden]
     return {
         "index": index, "kind": kind, "hidden": hidden, "machine_seed": machine_seed, "geometry": geometry,
         "gaps": gaps, "modes": modes,
@@ -292,9 +304,10 @@ def _experiment(d: Any, chain: Any, case: dict[str, Any], test: Any, stages_of: 
 def judge_case(
     seed: int, index: int, duration: float, rate: int, experiments: bool = False, machine: str = "hydraulic",
     learn: bool = False, kinds: Sequence[str] = KINDS, leave_out: bool = False, loggers: bool = False,
+    begins: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Simulate, write, diagnose and score one log of a ``machine`` of `MACHINES`; a flat record."""
-    case = draw_case(seed, index, duration, machine, kinds, leave_out)
+    case = draw_case(seed, index, duration, machine, kinds, leave_out, begins)
     plant, motor = build_plant(MACHINES[machine]), machine == "electromechanical"
     test = rig.manoeuvre(case["machine_seed"], duration)
     logger = draw(np.random.default_rng([seed, index, 1])) if loggers else None
@@ -370,6 +383,7 @@ def judge_case(
         "geometry": json.dumps(asdict(case["geometry"])),
         "gaps": json.dumps(case["gaps"]), "modes": json.dumps([asdict(s) for s in case["modes"]]),
         "logger": json.dumps(asdict(logger) if logger else None),
+        "onset": case["hidden"][0].onset if begins and case["hidden"] else None,
         "detectable": detectable, "verdict": answer["verdict"], "named": named, "rivals": json.dumps(rivals),
         "probabilities": [e["probability"] for e in answer["effects"]],
         "unknown_stages": [u["stage"] for u in answer["unknown"]], "shapes": [u["shape"] for u in answer["unknown"]],
@@ -507,6 +521,11 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "parameter within 5 % of the truth": share(
             [abs(i["value"] - i["truth"]) <= 0.05 * abs(i["truth"]) for i in intervals]
         ),
+        f"onset within {ONSET_NEAR:g} s": share(
+            [abs(e.get("onset_s", {"value": 0.0})["value"] - r["onset"]) <= ONSET_NEAR
+             for r in rows if r.get("onset") is not None for e in json.loads(r["answer"])["effects"]
+             if any(m in r["truth"] for m in (e["effect"], *e["rivals"]))]
+        ),
         "separable ties decided by the experiment": share([e["resolved"] for e in tried if e["separable"]]),
         "effects named with P < 0.5 and no rival, or on a bound": share(
             [_too_easy(e) for r in rows for e in json.loads(r["answer"])["effects"]]
@@ -619,7 +638,7 @@ def command(args: argparse.Namespace) -> int:
         )
     run(
         args, "logs", args.logs, rows, path, judge_case, seed, args.duration, args.rate, args.experiments, machine,
-        args.learn, tuple(k for k in KINDS if k in args.kinds), args.leave_out, args.loggers,
+        args.learn, tuple(k for k in KINDS if k in args.kinds), args.leave_out, args.loggers, args.begins,
     )  # fmt: skip
     s = summary(rows)
     spent = f"{s['median seconds']:.1f} s a diagnosis"

@@ -17,10 +17,10 @@ from typing import TypeVar
 import numpy as np
 
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
-from vaneloop.identification.settings import NINETY, ONSET_BLOCKS
+from vaneloop.identification.settings import NINETY_ONSET, ONSET_BLOCKS
 from vaneloop.identification.subsystem import Array, Parameter, Stage
 
-__all__ = ["Onset", "beginning_at", "begun", "change_point", "onset_of", "quiet_until", "that_begins"]
+__all__ = ["Onset", "begun", "change_point", "onset_of", "quiet_until", "that_begins"]
 
 NAME = "onset"
 GRID = 33  # times that are tried at once: of each pass, the two intervals next to the best are the next pass's range
@@ -96,8 +96,12 @@ def _column(stage: Stage) -> int | None:
     return next((i for i, p in enumerate(stage.parameters) if p.name == NAME), None)
 
 
-def begun(stage: Stage, onset: float) -> Stage:
-    """The same stage, whose effects act from ``onset`` (s) on."""
+def begun(stage: Stage, onset: float | None) -> Stage:
+    """The same stage, whose effects act from ``onset`` (s) on; None: all along. A fit leaves what it does not set free
+    at the stage's values.
+    """
+    if onset is None:
+        return stage
     parameters = tuple(replace(p, value=onset) if p.name == NAME else p for p in stage.parameters)
     return replace(stage, parameters=parameters)
 
@@ -108,18 +112,6 @@ def onset_of(stage: Stage, theta: Array) -> float | None:
     if column is None or theta[column] <= stage.t[0]:
         return None
     return float(theta[column])
-
-
-def beginning_at(stage: Stage, theta: Array, onset: float | None) -> Array:
-    """The same parameters with effects that act from ``onset`` (s) on; None, or a stage whose effects cannot begin: as
-    they are.
-    """
-    column = _column(stage)
-    if onset is None or column is None:
-        return theta
-    out = theta.copy()
-    out[column] = onset
-    return out
 
 
 def quiet_until(judge: LeastSquaresProblem, fails: Callable[[LeastSquaresProblem, Fit], bool]) -> float | None:
@@ -148,35 +140,48 @@ def quiet_until(judge: LeastSquaresProblem, fails: Callable[[LeastSquaresProblem
 
 
 def change_point(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> Onset:
-    """The onset with which the parameters of ``fit`` leave the least sum of squares, and its 90 % interval.
+    """The onset with which the parameters of ``fit`` leave the least sum of squares, half-way between two samples, and
+    its 90 % interval: all onsets that leave no more than `NINETY_ONSET` beyond it.
 
     correlation  samples of the error that count as one observation
     """
-    column = _column(judge.stage)
-    assert column is not None
-    tried: dict[float, float] = {}
-
-    def costs(times: Array) -> None:
-        new = [float(t) for t in times if float(t) not in tried]
-        thetas = np.repeat(fit.theta[None], len(new), axis=0)
-        thetas[:, column] = new
-        for i in range(0, len(new), GRID):
-            squares = judge.block_costs(judge.errors(thetas[i : i + GRID])).sum(axis=1)
-            tried.update(zip(new[i : i + GRID], squares.tolist(), strict=True))
-
-    t = judge.stage.t
-    low, high, finest = float(t[0]), float(t[-1]), float(np.median(np.diff(t)))
+    t, squares = judge.stage.t, _Squares(judge, fit)
+    low, high = 1, len(t) - 1
     while True:
-        costs(np.linspace(low, high, GRID))
-        best = min(tried, key=lambda at: tried[at])
-        step = (high - low) / (GRID - 1)
-        if step <= finest:
+        step = max(1, (high - low) // (GRID - 1))
+        best = squares.least(np.arange(low, high + 1, step))
+        if step == 1:
             break
-        low, high = max(best - step, float(t[0])), min(best + step, float(t[-1]))
-    away = finest * np.geomspace(1.0, (t[-1] - t[0]) / finest, GRID)
-    costs(np.clip(np.concatenate([best - away, best + away]), t[0], t[-1]))
-    near = [at for at, squares in tried.items() if squares <= tried[best] + NINETY**2 * correlation]
-    beyond = np.array(sorted(at for at in tried if at not in near))
-    # as far as the nearest time on each side that the log rules out
-    low, high = beyond[beyond < best].max(initial=t[0]), beyond[beyond > best].min(initial=t[-1])
-    return Onset(best, float(low), float(high))
+        low, high = max(best - step, 1), min(best + step, len(t) - 1)
+    away = np.unique(np.geomspace(1.0, len(t), 2 * GRID).astype(int))
+    squares.least(np.clip(np.concatenate([best - away, best + away]), 1, len(t) - 1))
+    most = squares.of[best] + NINETY_ONSET * correlation
+    inside = [k for k, value in squares.of.items() if value <= most]
+    # an onset before sample k lies behind sample k - 1
+    first = max((k for k in squares.of if k < min(inside)), default=0)
+    last = min((k for k in squares.of if k > max(inside)), default=len(t))
+    return Onset(squares.time(best), float(t[first]), float(t[last - 1]))
+
+
+class _Squares:
+    """Sums of squares of a fit's parameters with an onset before each of some samples; ``of``: by sample."""
+
+    def __init__(self, judge: LeastSquaresProblem, fit: Fit):
+        self.judge, self.fit, self.column = judge, fit, _column(judge.stage)
+        self.of: dict[int, float] = {}
+
+    def time(self, k: int) -> float:
+        """The time half-way between sample ``k`` and the one before, s."""
+        t = self.judge.stage.t
+        return float(0.5 * (t[k - 1] + t[k]))
+
+    def least(self, samples: Array) -> int:
+        """Of these samples and all that were tried before, the one with an onset before it that leaves least."""
+        new = [k for k in dict.fromkeys(samples.tolist()) if k not in self.of]
+        for i in range(0, len(new), GRID):
+            part = new[i : i + GRID]
+            thetas = np.repeat(self.fit.theta[None], len(part), axis=0)
+            thetas[:, self.column] = [self.time(k) for k in part]
+            left = self.judge.block_costs(self.judge.errors(thetas)).sum(axis=1)
+            self.of.update(zip(part, left.tolist(), strict=True))
+        return min(self.of, key=lambda k: self.of[k])

@@ -14,7 +14,7 @@ import numpy as np
 from vaneloop.base.side_by_side import forks, in_processes
 from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
-from vaneloop.identification.onset import beginning_at, onset_of
+from vaneloop.identification.onset import begun, onset_of
 from vaneloop.identification.regimes import Located, Shape, StageFigures, agrees, locate, shape
 from vaneloop.identification.results import StageDiagnosis, parameters_of, recalibrated, rms_of, rms_per_output, weigh
 from vaneloop.identification.selection.diagnosis import Judged, diagnose_stage, extend_stage, floor_of
@@ -218,7 +218,7 @@ def _agree(stages: dict[str, Stage], results: list[StageDiagnosis]) -> None:
     place if it explains as much; else the stage's answer is "unknown".
     """
     for d in results:
-        judge = LeastSquaresProblem(stages[d.stage], d.floor)
+        judge = LeastSquaresProblem(begun(stages[d.stage], onset_of(stages[d.stage], d.final.theta)), d.floor)
         for k, f in enumerate(d.effects):
             elsewhere = {
                 m: [o for o in results if o is not d and o.verdict != "unknown" and m in stages[o.stage].index()]
@@ -297,11 +297,11 @@ def _fits(
     size = np.clip(there, fit.low[at] - wider, fit.high[at] + wider)
     if np.array_equal(size, there):
         return True
-    judge = LeastSquaresProblem(stage, other.floor)
+    # from when on it acts is the machine's, too
+    when = onset_of(stages[d.stage], fit.theta) if not other.final.effects else onset_of(stage, other.final.theta)
+    judge = LeastSquaresProblem(begun(stage, when), other.floor)
     start = other.final.theta.copy()
     start[theirs] = size
-    if not other.final.effects:  # from when on it acts is the machine's, too
-        start = beginning_at(stage, start, onset_of(stages[d.stage], fit.theta))
     held = judge.fit(tuple(e for e in other.final.effects if e != effect), start, 6)
     return not significant(judge, held, other.final, correlation_of(judge, other.final))
 

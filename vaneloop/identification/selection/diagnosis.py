@@ -16,7 +16,7 @@ import numpy as np
 
 from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, recalibrate
-from vaneloop.identification.onset import beginning_at, begun, change_point, onset_of, quiet_until
+from vaneloop.identification.onset import begun, change_point, onset_of, quiet_until
 from vaneloop.identification.regimes import agrees
 from vaneloop.identification.results import Candidate, StageDiagnosis, answer_of, found_of, rms_of
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
@@ -29,6 +29,7 @@ from vaneloop.identification.settings import (
     EXCERPT_SAMPLES,
     LONG_SAMPLES,
     ONSET_ROUNDS,
+    ONSET_STEPS,
     PAIR_LEADERS,
     TOLERATED,
 )
@@ -98,16 +99,17 @@ def _confirm(
     stage: Stage, keep: Array | None, floor: Array, base: Fit, said: StageDiagnosis, judged: Judged
 ) -> StageDiagnosis:
     """Fit what an excerpt said to the whole log; an effect that the whole log does not need is dropped."""
+    begins = onset_of(stage, said.final.theta)
+    if begins is not None:
+        judge = LeastSquaresProblem(stage, said.floor, keep)
+        begins = change_point(judge, said.final, said.correlation).value
+        stage = begun(stage, begins)
     judge = LeastSquaresProblem(stage, said.floor, keep)
     criterion = judged(judge)
     nominal = base if np.array_equal(floor, said.floor) else judge.fit((), base.theta, 4)
     chosen, current = said.final.effects, nominal
-    begins = onset_of(stage, said.final.theta)
     if chosen:
-        start = said.final.theta
-        if begins is not None:
-            start = beginning_at(stage, start, change_point(judge, said.final, said.correlation).value)
-        current = judge.fit(chosen, start, 8)
+        current = judge.fit(chosen, said.final.theta, 8)
         if judge.total_of(current) > judge.total_of(nominal):  # what suits the excerpt may suit nothing else
             current = judge.fit(chosen, nominal.theta, 8)
     criterion.learn(current)
@@ -136,7 +138,7 @@ def _confirm(
     if chosen:
         steps.append((" + ".join(chosen), rms_of(judge, current)))
     out = criterion.conclude(nominal, current, effects, said.candidates, steps)
-    if current.effects and onset_of(stage, current.theta) is not None:
+    if current.effects and begins is not None:
         out.onset = change_point(judge, current, correlation_of(judge, current))
     return out
 
@@ -210,8 +212,15 @@ def _whenever(
             break
         judge = LeastSquaresProblem(stage, found.floor, keep)
         correlation = correlation_of(judge, found.final)
-        when = change_point(judge, found.final, correlation)
-        if found.verdict == "missing" and when.low <= at <= when.high:
+        fit, when = found.final, change_point(judge, found.final, correlation)
+        settled = when.low < at <= when.high
+        for _ in range(0 if settled else ONSET_STEPS):
+            if when.value == at:
+                break
+            at = when.value
+            fit = LeastSquaresProblem(begun(stage, at), found.floor, keep).fit(fit.effects, fit.theta, 4)
+            when = change_point(judge, fit, correlation)
+        if settled and found.verdict == "missing":
             thetas = np.array([said.final.theta, found.final.theta])
             always, later = judge.totals(judge.errors(thetas), thetas)
             case = Beginning(0.5 * float(always - later) / correlation, judge.n_blocks)
@@ -219,7 +228,6 @@ def _whenever(
             if decisions.decide([BEGINS], case, found.final.effects, said.final.effects):
                 return replace(found, onset=when, decisions=list(decisions))
             break
-        at = when.value
     return said
 
 
