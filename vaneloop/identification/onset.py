@@ -17,13 +17,12 @@ from typing import TypeVar
 import numpy as np
 
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
-from vaneloop.identification.settings import NINETY_ONSET, ONSET_BLOCKS
+from vaneloop.identification.settings import MAX_SETS, NINETY_ONSET, ONSET_BLOCKS
 from vaneloop.identification.subsystem import Array, Parameter, Stage
 
 __all__ = ["Onset", "begun", "change_point", "onset_of", "quiet_until", "that_begins"]
 
 NAME = "onset"
-GRID = 33  # times that are tried at once: of each pass, the two intervals next to the best are the next pass's range
 
 Driven = TypeVar("Driven")
 Run = Callable[[Array], Array]
@@ -148,12 +147,12 @@ def change_point(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> On
     t, squares = judge.stage.t, _Squares(judge, fit)
     low, high = 1, len(t) - 1
     while True:
-        step = max(1, (high - low) // (GRID - 1))
+        step = max(1, (high - low) // (MAX_SETS - 1))
         best = squares.least(np.arange(low, high + 1, step))
         if step == 1:
             break
         low, high = max(best - step, 1), min(best + step, len(t) - 1)
-    away = np.unique(np.geomspace(1.0, len(t), 2 * GRID).astype(int))
+    away = np.unique(np.geomspace(1.0, len(t), 2 * MAX_SETS).astype(int))
     squares.least(np.clip(np.concatenate([best - away, best + away]), 1, len(t) - 1))
     most = squares.of[best] + NINETY_ONSET * correlation
     inside = [k for k, value in squares.of.items() if value <= most]
@@ -178,8 +177,8 @@ class _Squares:
     def least(self, samples: Array) -> int:
         """Of these samples and all that were tried before, the one with an onset before it that leaves least."""
         new = [k for k in dict.fromkeys(samples.tolist()) if k not in self.of]
-        for i in range(0, len(new), GRID):
-            part = new[i : i + GRID]
+        for i in range(0, len(new), MAX_SETS):
+            part = new[i : i + MAX_SETS]
             thetas = np.repeat(self.fit.theta[None], len(part), axis=0)
             thetas[:, self.column] = [self.time(k) for k in part]
             left = self.judge.block_costs(self.judge.errors(thetas)).sum(axis=1)

@@ -252,17 +252,16 @@ ONSET_BLOCKS = setting(
     "principle: a gain is no gain where a single block has it",
 )
 ONSET_ROUNDS = setting(
-    4, "searches", "The time at which effects begin is found in at most so many searches.", "budget of work"
-)
-ONSET_STEPS = setting(
-    8, "fits", "Of one search, the onset and the sizes are fitted in turn so often at most.", "budget of work"
+    4,
+    "rounds",
+    "Effects that begin, and the time at which they do, are found in turn, at most so often.",
+    "budget of work: the time moves by samples after the second round",
 )
 NINETY_ONSET = setting(
     5.94,
     "noise floors squared",
     "The interval of an onset holds all that leave so much more of the sum of squares than the best.",
-    "principle: -2 log(1 - sqrt(0.9)), since a change point's likelihood ratio is at most x with (1 - exp(-x / 2))^2 "
-    "(Hansen 2000, Sample splitting and threshold estimation)",
+    "principle: nine in ten by Hansen (2000); a likelihood ratio below x has probability (1 - exp(-x / 2))^2",
 )
 NATS = setting(
     12.0,

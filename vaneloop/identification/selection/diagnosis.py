@@ -29,7 +29,6 @@ from vaneloop.identification.settings import (
     EXCERPT_SAMPLES,
     LONG_SAMPLES,
     ONSET_ROUNDS,
-    ONSET_STEPS,
     PAIR_LEADERS,
     TOLERATED,
 )
@@ -214,7 +213,7 @@ def _whenever(
         correlation = correlation_of(judge, found.final)
         fit, when = found.final, change_point(judge, found.final, correlation)
         settled = when.low < at <= when.high
-        for _ in range(0 if settled else ONSET_STEPS):
+        for _ in range(0 if settled else ONSET_ROUNDS):
             if when.value == at:
                 break
             at = when.value
