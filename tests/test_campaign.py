@@ -110,7 +110,7 @@ def run(plan: Path, out: Path) -> None:
 
 @pytest.mark.slow
 def test_probability_worst_case_and_indices_where_the_truth_is_known(tmp_path: Path) -> None:
-    plan, out = write(tmp_path), tmp_path / "run"
+    plan, out = write(tmp_path, keys="saved = 3"), tmp_path / "run"
     run(plan, out)
     words = ["campaign", str(plan), "--out", str(out), "--report", str(tmp_path / "c.html")]
     words += ["--json", str(tmp_path / "c.json"), "--junit", str(tmp_path / "c.xml"), "--quiet"]
@@ -128,6 +128,13 @@ def test_probability_worst_case_and_indices_where_the_truth_is_known(tmp_path: P
     assert main([*again[1:], "--json", str(tmp_path / "again.json"), "--quiet"]) == 1
     (o,) = json.loads((tmp_path / "again.json").read_text())["scenarios"]
     assert o["state_hash"] == g["state_hash"] and g["same"]
+    assert [f["name"] for f in g["failures"]] and len(g["failures"]) == 3 and g["failures_not_saved"] == 1
+    for f in g["failures"]:  # each runs alone to the verdict and the margin that it had in lanes
+        assert f["same"] and Path(f["file"]).parent == out / "failed" / g["name"] / "machines"
+        assert main([*f["command"].split()[1:], "--json", str(tmp_path / "alone.json"), "--quiet"]) == 1
+        (o,) = json.loads((tmp_path / "alone.json").read_text())["scenarios"]
+        assert [c["held"] for c in o["expectations"]].count(False) == 1
+    assert "3 of 4 failed machines saved, the worst first; 1 more failed" in (tmp_path / "c.html").read_text()
     cases = {c.get("name"): c.find("failure") is not None for c in Xml.parse(tmp_path / "c.xml").iter("testcase")}
     assert cases[claim["expected"]] and not cases["mode changes as documented"] and cases["the combination passes"]
     assert "worst machine" in (tmp_path / "c.html").read_text()

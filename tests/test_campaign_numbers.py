@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import tomllib
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -24,6 +25,7 @@ from vaneloop.fleet import plan as plans
 from vaneloop.fleet.files import whole_json
 from vaneloop.fleet.folder import Folder
 from vaneloop.fleet.plan import Choice, Group, Plan, Varied, draw, groups, load_plan, model_of, varied
+from vaneloop.pages.campaign import GroupView
 
 Array = Any
 
@@ -78,6 +80,9 @@ def test_a_plan_without_more_is_that_of_the_documentation() -> None:
         ({"confidence": 1.0}, False),
         ({"allowed": 0.0}, False),
         ({"allowed": 1.0}, False),
+        ({"saved": 0}, True),
+        ({"saved": 1000}, True),
+        ({"saved": 1001}, False),
         ({"seed": 0}, True),
         ({"seed": -1}, False),
         ({"title": "abc"}, False),
@@ -704,6 +709,15 @@ def test_indices_are_those_of_a_plane(monkeypatch: pytest.MonkeyPatch) -> None:
             assert campaign._indices(plan, TWO, nowhere, g, rows, ["m"]) == ([], []), name
 
 
+def point_of(model: str, among: Array) -> Array:
+    """The point of the unit cube that a saved model file is of, of those among which it must be."""
+    made = tomllib.loads(Path(model).read_text())
+    distance = among - [made["parameters"]["a.x"] - 1.5, made["effects"]["jam"]["force"] / 10.0 - 1.0]
+    nearest = np.abs(distance).max(axis=1)
+    assert nearest.min() < 1e-12
+    return among[int(nearest.argmin())]
+
+
 @pytest.mark.parametrize("search", [True, False])
 def test_a_campaign_says_how_many_fail_and_which_is_worst(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, search: bool
@@ -718,9 +732,7 @@ def test_a_campaign_says_how_many_fail_and_which_is_worst(
 
     def once(files: dict[str, str], g: Group, quantities: Any, point: Any) -> dict[str, Any]:
         again.append((files, g.name, quantities, point))
-        value = (
-            fails(np.array([0.01, 0.99])) if search else min(fails(x) for i, x in enumerate(draw(plan, 2)[0]) if i != 6)
-        )
+        value = fails(point_of(files["model"], np.vstack([draw(plan, 2)[0], [0.01, 0.99]])))
         return {"state_hash": f"{value}", "margins": [claim("m", value), claim("idle", 0.1)]}
 
     monkeypatch.setattr(campaign, "trial_once", once)
@@ -747,9 +759,79 @@ def test_a_campaign_says_how_many_fail_and_which_is_worst(
     assert (
         g.command == shlex.join(words) and (at / "command.txt").read_text() == g.command + "\n" and g.saved == str(at)
     )
-    assert again == [({"scenario.still": str(at / "still.toml"), "model": str(at / "model.toml")}, g.name, [], [])]
+    assert again[0] == ({"scenario.still": str(at / "still.toml"), "model": str(at / "model.toml")}, g.name, [], [])
+    assert len(again) == 1 + failed and [f.least for f in g.failures] == sorted(s for s in shares if s < 0.0)
+    assert g.reproduces and g.saved_failures() == f"{failed} of {failed} failed machines saved, the worst first"
     model = (at / "model.toml").read_text()
     assert "campaign run, worst case of still.shipped.shipped" in model and f"{g.worst[0]!r}"[:12] in model
+
+
+@pytest.mark.parametrize(("off", "same"), [(0.0, True), (5e-10, True), (5e-9, False)])
+@pytest.mark.parametrize("alone", ["", "why", None])
+def test_failed_machines_are_saved_the_worst_first_and_run_again_to_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, off: float, same: bool, alone: str | None
+) -> None:
+    """Bit for bit where the first run was on the bus; of one from lanes the margins to 1e-9. The rest is counted."""
+    plan, quantities, run = begun(tmp_path, monkeypatch, "samples = 16\nsearch = 0\nsaved = 3")
+    fails = lambda u: 1.5 * slope(u) - 0.8  # noqa: E731
+    a, _ = draw(plan, 2)
+    campaign.take_samples(plan, quantities, run)
+    answered(run, fails)
+    rows = campaign._rows
+    monkeypatch.setattr(
+        campaign,
+        "_rows",
+        lambda *of: {n: r | ({} if alone is None else {"alone": alone}) for n, r in rows(*of).items()},
+    )
+    first: list[float] = []
+
+    def once(files: dict[str, str], g: Group, quantities: Any, point: Any) -> dict[str, Any]:
+        u = point_of(files["model"], a) if "model" in files else np.array(point)
+        value = fails(u) if not first else fails(u) + off  # the first run is of the worst machine
+        first.append(value)
+        return {"point": point, "state_hash": f"{fails(u)}", "margins": [claim("m", value), claim("idle", 0.1)],
+                "held": value >= 0.0, "seen": []}  # fmt: skip
+
+    monkeypatch.setattr(campaign, "trial_once", once)
+    old = run.path / "failed" / "still.shipped.shipped" / "machines" / "000099.toml"
+    old.parent.mkdir(parents=True)
+    old.write_text("")
+    view = campaign.judge(plan, quantities, run, lambda share: None)
+    (g,) = view.groups
+    order = sorted((x for x in a if fails(x) < 0.0), key=fails)
+    assert len(order) == g.failed > 4 and not old.exists()
+    at = run.path / "failed" / "still.shipped.shipped"
+    files = [at / "machines" / f"{f.name}.toml" for f in g.failures]
+    assert sorted(files) == sorted((at / "machines").iterdir()) and [f.file for f in g.failures] == list(
+        map(str, files)
+    )
+    for f, x in zip(g.failures, order[:3], strict=True):
+        assert np.array_equal(point_of(f.file, a), x) and f.least == fails(x) and np.array_equal(a[int(f.name)], x)
+        assert shlex.split(f.command) == ["vaneloop", "inject", str(at / "still.toml"), "--model", f.file]
+        assert f.same == (same if alone == "" else off == 0.0)
+    assert g.reproduces == (g.same and g.failures[0].same) and (g.reproduces or not view.passed(g))
+    left = g.failed - 3
+    assert g.saved_failures() == f"3 of {g.failed} failed machines saved, the worst first; {left} more failed and " + (
+        "are not saved"
+    )
+    assert view.json()["groups"][0]["failures_not_saved"] == left
+    assert view.json()["groups"][0]["failures"][0] == asdict(g.failures[0])
+
+
+def test_no_failed_machine_is_saved_where_none_is_asked_for_or_none_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan, quantities, run = begun(tmp_path, monkeypatch, "samples = 8\nsearch = 0\nsaved = 0")
+    campaign.take_samples(plan, quantities, run)
+    answered(run, lambda u: -1.0)
+    answer = {"state_hash": "-1.0", "margins": [claim("m", -1.0), claim("idle", 0.1)]}
+    monkeypatch.setattr(campaign, "trial_once", lambda *of: answer)
+    (g,) = campaign.judge(plan, quantities, run, lambda share: None).groups
+    said = "0 of 8 failed machines saved, the worst first; 8 more failed and are not saved"
+    assert not g.failures and not (run.path / "failed").exists() and g.saved_failures() == said
+    assert GroupView.saved_failures(SimpleNamespace(failed=0, failures=[])) == ""
+    one = GroupView.saved_failures(SimpleNamespace(failed=1, failures=[]))
+    assert one.endswith("1 more failed and is not saved")
 
 
 def test_a_campaign_without_an_answer_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -446,7 +446,9 @@ def test_a_damaged_answer_is_a_row_and_a_retry_makes_it_anew(
         assert ("its answer is damaged" in (tmp_path / "f.html").read_text()) == left
 
 
-@pytest.mark.parametrize("room", ["results", "leases", "workers", "journal", "parts", "logs", "machine", "worst"])
+@pytest.mark.parametrize(
+    "room", ["results", "leases", "workers", "journal", "parts", "logs", "machine", "worst", "failed"]
+)
 def test_a_link_in_place_of_a_folder_is_not_followed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], room: str
 ) -> None:

@@ -41,7 +41,7 @@ from vaneloop.identification.user_models.by_log import ByLog, Logs
 from vaneloop.identification.vane_chain.experiment import HEADS
 from vaneloop.identification.workflow import Diagnosis
 from vaneloop.pages.by_log import curves_by_log, log_by_log
-from vaneloop.pages.campaign import CampaignView, GroupView, Requirement, campaign_page
+from vaneloop.pages.campaign import CampaignView, FailedMachine, GroupView, Requirement, campaign_page
 from vaneloop.pages.design import design_page
 from vaneloop.pages.diagnosis import compare_page, diagnosis_page, experiment_page, extended_page
 from vaneloop.pages.engine_test import engine_test_report
@@ -706,7 +706,9 @@ def test_a_campaign_that_is_broken() -> None:
     ]
     view = campaign([
         group(failed=3, lost=1, low=0.01, high=0.13, requirements=broken, least=-0.25,
-              seen=["at 3 s: fault", "at 4 s: abort"], first=[], total=[]),
+              seen=["at 3 s: fault", "at 4 s: abort"], first=[], total=[],
+              failures=[FailedMachine(f"00000{k}", -0.2, f"out/failed/00000{k}.toml", "vaneloop inject", k == 1)
+                        for k in (1, 2)]),
         group("stop.soft.mine", by_search=False, same=False, total=[0.2, 1.2]),
     ])  # fmt: skip
     approve("campaign_broken", outline(campaign_page(view)))
@@ -716,6 +718,8 @@ def test_what_a_group_of_a_campaign_needs_to_pass() -> None:
     never, some = campaign([]), campaign([], 0.05)
     assert never.passed(group()) and some.passed(group())
     assert not never.passed(group(lost=1)) and not never.passed(group(same=False))
+    for same in (True, False):
+        assert some.passed(group(failed=1, failures=[FailedMachine("0", -0.2, "f", "c", same)])) == same
     assert not some.passed(group(lost=1)) and not some.passed(group(same=False))
     for bad in (requirement(broken=1), requirement(held=False)):
         assert not never.passed(group(requirements=[requirement(), bad])) and some.passed(group(requirements=[bad]))

@@ -111,7 +111,7 @@ def _work(args: argparse.Namespace, folder: object, what: str) -> None:
 def _show(args: argparse.Namespace, view: CampaignView, search: int) -> None:
     rows = [
         [g.name, "passes" if view.passed(g) else "FAILS", f"{g.failed} of {g.trials}", f"{g.low:.2g} to {g.high:.2g}",
-         f"{g.least:.3g}", "search" if g.by_search else "sample", "yes" if g.same else "NO"] for g in view.groups
+         f"{g.least:.3g}", "search" if g.by_search else "sample", "yes" if g.reproduces else "NO"] for g in view.groups
     ]  # fmt: skip
     interval = f"{100.0 * view.confidence:g} % interval"
     columns = ["combination", "", "failed", interval, "least margin", "found by", "reproduces"]
@@ -128,6 +128,11 @@ def _show(args: argparse.Namespace, view: CampaignView, search: int) -> None:
         if search and not g.runs:
             terminal.say(args, f"no search in {g.name}: too few of its trials have an answer")
         terminal.say(args, f"worst case: {g.command}")
+        if saved := g.saved_failures():
+            terminal.say(args, f"{g.name}: {saved}{f'; the first: {g.failures[0].command}' if g.failures else ''}")
+        for f in g.failures:
+            if not f.same:
+                terminal.say(args, f"does NOT reproduce: {f.command}")
     terminal.say(args, view.sentence())
 
 
@@ -141,6 +146,7 @@ def _write_junit(file: str, view: CampaignView) -> None:
             cases.append((r.expected, text if r.fails and view.allowed is None else ""))
         text = f"failed {g.failed} of {g.trials} machines, {g.low:.3g} to {g.high:.3g}; {g.lost} without an answer; "
         text += f"worst case {'reproduces' if g.same else 'does not reproduce'}: {g.command}"
+        text += "".join(f"; failed machine does not reproduce: {f.command}" for f in g.failures if not f.same)
         cases.append(("the combination passes", "" if view.passed(g) else text))
         numbers = {"tests": len(cases), "failures": sum(bool(t) for _, t in cases), "errors": 0, "skipped": 0}
         suite = Xml.SubElement(root, "testsuite", {"name": g.name, **{k: str(v) for k, v in numbers.items()}})

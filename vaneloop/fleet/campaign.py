@@ -2,6 +2,7 @@
 
     trials/GROUP/000012.json      a sample; b..., ab...: points of the sensitivity indices; search.json: the search
     worst/GROUP/                  scenario, model and tables of the worst machine, and the command that runs it again
+    failed/GROUP/                 the same files, and in machines/ a model file for each failed sample, the worst first
 
 A group is one scenario with one calibration and one firmware.
 """
@@ -32,7 +33,7 @@ from vaneloop.fleet.plan import Group, Plan, Varied
 from vaneloop.fleet.sources import Source
 from vaneloop.fleet.tables import answers
 from vaneloop.fleet.trial import is_answer, model_at, moving, trial_once, worst_share
-from vaneloop.pages.campaign import CampaignView, GroupView, Requirement
+from vaneloop.pages.campaign import CampaignView, FailedMachine, GroupView, Requirement
 
 __all__ = ["begin", "interval", "judge", "take_samples", "take_searches"]
 
@@ -49,7 +50,7 @@ def begin(file: str | Path, out: str | Path, limit: float) -> tuple[Plan, list[V
         quantities = plans.varied(plan, machine.plant, file)
         for corner in (0.0, 1.0):  # limits that a model file may not have are refused before anything is begun
             plans.group_machine(files, g, model_at(files, g, quantities, [corner] * len(quantities)))
-    told = plan.model_dump(mode="json", exclude={"title", "confidence", "allowed"})
+    told = plan.model_dump(mode="json", exclude={"title", "confidence", "allowed", "saved"})
     for c in (
         told["calibration"] + told["firmware"]
     ):  # where the files lay is no part of the campaign; their contents are
@@ -141,6 +142,8 @@ def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[
             worst, lanes = trial_once(files, g, quantities, worst["point"]), worst
             agreed = _agree(worst, lanes)
         saved, command, same = _save(folder, files, plan, g, quantities, worst)
+        kept = _worst_failed(rows, among, plan.saved)
+        failures = _save_failed(folder, files, g, quantities, kept, among)
         shares, points = [worst_share(r, among) for r in done], [r["point"] for r in done]
         least, runs = worst_share(worst, among), search["runs"] if search else 0
         alone = dict(Counter(r["alone"] for r in done if r.get("alone")))
@@ -149,12 +152,19 @@ def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[
             g.name, g.scenario, g.calibration, g.firmware, len(done), len(rows) - len(done), failed, low, high,
             _requirements(done, search), shares, points, plans.values_at(quantities, worst["point"]), least, by_search,
             runs, worst["seen"], worst["state_hash"], str(saved), command, same and agreed, first, total, alone,
+            failures,
         ))  # fmt: skip
         told((k + 1) / len(all_groups))
     return CampaignView(
         plan.title, str(folder.path), folder.job["version"], [vars(q) for q in quantities], plan.confidence,
         plan.allowed, plan.sampling, plan.seed, shown,
     )  # fmt: skip
+
+
+def _worst_failed(rows: dict[str, dict[str, Any] | None], among: list[str], most: int) -> dict[str, dict[str, Any]]:
+    """The failed samples with the least margins, by their names, the worst first."""
+    failed = [(worst_share(r, among), name, r) for name, r in rows.items() if r is not None and not r["held"]]
+    return {name: r for _, name, r in sorted(failed, key=lambda f: f[:2])[:most]}
 
 
 def _agree(one: dict[str, Any], other: dict[str, Any]) -> bool:
@@ -199,38 +209,96 @@ def _save(
     same, bit for bit.
     """
     at = folder.room("worst", g.name)
-    scenario, model = at / f"{g.scenario}.toml", at / "model.toml"
+    model = at / "model.toml"
+    contents, own = _copied(folder, files, g, at)
     made = model_at(files, g, quantities, worst["point"])
-    contents: dict[Path, str | bytes] = {
-        scenario: Path(files[f"scenario.{g.scenario}"]).read_bytes(),
-        model: text_of(made.noted(f"campaign {folder.path.name}, worst case of {g.name}")),
-    }
-    own = {f"scenario.{g.scenario}": str(scenario), "model": str(model)}
-    words = ["vaneloop", "inject", str(scenario), "--model", str(model)]
-    for option, key in (
-        ("tables", f"tables.{g.calibration}"),
-        ("plant", "plant"),
-        ("controller", f"firmware.{g.firmware}"),
-    ):
+    contents[model] = text_of(made.noted(f"campaign {folder.path.name}, worst case of {g.name}"))
+    command = _command(own, g, model)
+    contents[at / "command.txt"] = f"{command}\n"
+    _write_alone(at, contents)
+    return at, command, _same(worst, trial_once({**own, "model": str(model)}, g, [], []))
+
+
+def _save_failed(
+    folder: Folder,
+    files: dict[str, str],
+    g: Group,
+    quantities: list[Varied],
+    failed: dict[str, dict[str, Any]],
+    among: list[str],
+) -> list[FailedMachine]:
+    """Save failed samples, by their names, as model files beside one copy of what they share, all files or none. Each
+    is run from its files on the lockstep bus: its verdicts must be the same, its margins to rounding.
+    """
+    if not failed and not (folder.path / "failed" / g.name).exists():
+        return []
+    at = folder.room("failed", g.name)
+    contents, own = _copied(folder, files, g, at) if failed else ({}, {})
+    models = {name: folder.room("failed", g.name, "machines") / f"{name}.toml" for name in failed}
+    for name, answer in failed.items():
+        made = model_at(files, g, quantities, answer["point"])
+        contents[models[name]] = text_of(made.noted(f"campaign {folder.path.name}, sample {name} of {g.name}"))
+    _write_alone(at, contents)
+    return [
+        FailedMachine(
+            name, worst_share(answer, among), str(models[name]), _command(own, g, models[name]),
+            _same(answer, trial_once({**own, "model": str(models[name])}, g, [], [])),
+        )
+        for name, answer in failed.items()
+    ]  # fmt: skip
+
+
+def _copied(
+    folder: Folder, files: dict[str, str], g: Group, at: Path
+) -> tuple[dict[Path, str | bytes], dict[str, str]]:
+    """What the machines of a group have in common, copied into a folder of the run: contents of the files, and the
+    copies by the names that `Plan` gives them.
+    """
+    scenario = at / f"{g.scenario}.toml"
+    contents: dict[Path, str | bytes] = {scenario: Path(files[f"scenario.{g.scenario}"]).read_bytes()}
+    own = {f"scenario.{g.scenario}": str(scenario)}
+    for option, key in _options(g):
         if key in files:
             of, copy = Path(files[key]), at / f"{option}{Path(files[key]).suffix}"
             for file in sorted(f for f in of.rglob("*") if f.is_file()) if of.is_dir() else [of]:
                 place = copy / file.relative_to(of)
-                folder.room("worst", g.name, *place.relative_to(at).parent.parts)
+                folder.room(*place.parent.relative_to(folder.path).parts)
                 contents[place] = file.read_bytes()
             own[key] = str(copy)
-            words += [f"--{option}", str(copy)]
-    contents[at / "command.txt"] = f"{shlex.join(words)}\n"
+    return contents, own
+
+
+def _options(g: Group) -> list[tuple[str, str]]:
+    """Options of ``vaneloop inject``, and the names of the files that they take in a group."""
+    return [("tables", f"tables.{g.calibration}"), ("plant", "plant"), ("controller", f"firmware.{g.firmware}")]
+
+
+def _command(own: dict[str, str], g: Group, model: Path) -> str:
+    """The command that runs one machine of a group from its files."""
+    words = ["vaneloop", "inject", own[f"scenario.{g.scenario}"], "--model", str(model)]
+    for option, key in _options(g):
+        words += [f"--{option}", own[key]] if key in own else []
+    return shlex.join(words)
+
+
+def _write_alone(at: Path, contents: dict[Path, str | bytes]) -> None:
+    """Write files into a folder, all or none, and remove what an earlier run left there."""
     write_all(contents)
-    for old in sorted(at.rglob("*"), reverse=True):  # of an earlier save
+    for old in sorted(at.rglob("*"), reverse=True):
         if old.is_dir() and not old.is_symlink():
             with suppress(OSError):  # it holds something
                 old.rmdir()
         elif old not in contents:
             old.unlink()
-    again = trial_once(own, g, [], [])
-    same = (again["state_hash"], again["margins"]) == (worst["state_hash"], worst["margins"])
-    return at, shlex.join(words), same
+
+
+def _same(answer: dict[str, Any], again: dict[str, Any]) -> bool:
+    """Whether a machine that is run again from its files comes to the same: bit for bit, or, where the answer is from
+    lanes, in its verdicts and to rounding in its margins.
+    """
+    if answer.get("alone") == "":
+        return _agree(answer, again)
+    return (again["state_hash"], again["margins"]) == (answer["state_hash"], answer["margins"])
 
 
 def _indices(

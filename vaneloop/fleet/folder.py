@@ -51,7 +51,7 @@ __all__ = ["STATUSES", "Entry", "Folder", "copies_of", "key_of", "sources_versio
 
 _COLUMNS = ("key", "status", "reason", "verdict", "answer")
 STATUSES = ("done", "refused", "defect", "died", "timeout", "changed", "unreadable")  # what may come of a log
-ROOMS = ("machine", "logs", "leases", "workers", "journal", "results", "parts", "trials", "worst")
+ROOMS = ("machine", "logs", "leases", "workers", "journal", "results", "parts", "trials", "worst", "failed")
 CODE = ("system", "controller", "firmware.")  # files of a machine that are run and not read; a dot: all that begin so
 MOST_JOB = 4 << 20  # bytes of run.json
 MOST_ROWS = 10_000_000  # of a table
@@ -369,7 +369,11 @@ class Folder:
         """Clear up after processes that were killed between a part and its clearing, or while they wrote a file; and
         set aside parts that are damaged: their logs are done anew.
         """
-        rooms = [(), *((r,) for r in ROOMS), *((r, f) for r in ("results", "trials", "worst") for f in self.names(r))]
+        rooms = [
+            (),
+            *((r,) for r in ROOMS),
+            *((r, f) for r in ("results", "trials", "worst", "failed") for f in self.names(r)),
+        ]
         for room in rooms:
             self._sweep(self.path.joinpath(*room))
         for chunk in self.finished():

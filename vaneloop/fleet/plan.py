@@ -78,6 +78,7 @@ class Plan(Table):
     search       runs more in each group, in search of the worst case; 0: none
     sensitivity  base points of the sensitivity indices: so many times (parameters + 1) runs more; 0: none
     confidence   of the intervals
+    saved        failed samples of each group that are saved as files, the worst first
     allowed      greatest failure probability that the interval's upper end may reach; without, any failure is one
     seed         of the draw and of the search
     """
@@ -88,6 +89,7 @@ class Plan(Table):
     sampling: Literal["sobol", "random"] = "sobol"
     search: Annotated[int, Field(ge=0, le=10_000)] = 40
     sensitivity: Annotated[int, Field(ge=0, le=10_000)] = 0
+    saved: Annotated[int, Field(ge=0, le=1000)] = 20
     confidence: Annotated[Finite, Field(gt=0.5, lt=1.0)] = 0.95
     allowed: Annotated[Finite, Field(gt=0.0, lt=1.0)] | None = None
     seed: Annotated[int, Field(ge=0)] = 1

@@ -11,7 +11,7 @@ from vaneloop.pages.figures import Line, Panel, overlay, ranking
 from vaneloop.pages.page import Page
 from vaneloop.pages.series import distribution
 
-__all__ = ["CampaignView", "GroupView", "Requirement", "campaign_page"]
+__all__ = ["CampaignView", "FailedMachine", "GroupView", "Requirement", "campaign_page"]
 
 DIGITS = 6  # of limits: a tolerance may be a thousandth
 
@@ -43,6 +43,19 @@ class Requirement:
 
 
 @dataclass(frozen=True)
+class FailedMachine:
+    """A failed sample that is saved: its name, its least margin (a share), its model file, the command that runs it
+    again, and whether it came to the same verdicts and margins from these files.
+    """
+
+    name: str
+    least: float
+    file: str
+    command: str
+    same: bool
+
+
+@dataclass(frozen=True)
 class GroupView:
     """One scenario with one calibration and one firmware.
 
@@ -54,6 +67,7 @@ class GroupView:
     same                   whether the saved case ran to the same bits
     first, total           sensitivity indices of the least margin; empty: none
     alone                  samples that ran on the lockstep bus and not in lanes, by the reason
+    failures               failed samples that are saved, the worst first
     """
 
     name: str
@@ -80,6 +94,20 @@ class GroupView:
     first: list[float]
     total: list[float]
     alone: dict[str, int] = field(default_factory=dict)
+    failures: list[FailedMachine] = field(default_factory=list)
+
+    @property
+    def reproduces(self) -> bool:
+        """Whether the worst machine and every failed one that is saved came to the same from their files."""
+        return self.same and all(f.same for f in self.failures)
+
+    def saved_failures(self) -> str:
+        """How many of the failed samples are saved, in words; empty: none failed."""
+        if not self.failed:
+            return ""
+        n, left = len(self.failures), self.failed - len(self.failures)
+        rest = f"; {left} more failed and {'is' if left == 1 else 'are'} not saved" if left else ""
+        return f"{n} of {self.failed} failed machines saved, the worst first{rest}"
 
 
 @dataclass(frozen=True)
@@ -97,10 +125,10 @@ class CampaignView:
     groups: list[GroupView]
 
     def passed(self, g: GroupView) -> bool:
-        """Whether a group is good: no trial lost and its case reproduced; and either nothing broken, or the interval's
-        upper end within what the plan allows.
+        """Whether a group is good: no trial lost and all that is saved reproduced; and either nothing broken, or the
+        interval's upper end within what the plan allows.
         """
-        if g.lost or not g.same:
+        if g.lost or not g.reproduces:
             return False
         return not any(r.fails for r in g.requirements) if self.allowed is None else g.high <= self.allowed
 
@@ -120,7 +148,7 @@ class CampaignView:
         """The answer as plain data."""
         out = {"schema": 1, **asdict(self), "passed": all(self.passed(g) for g in self.groups)}
         for row, g in zip(out["groups"], self.groups, strict=True):
-            row["passed"] = self.passed(g)
+            row |= {"passed": self.passed(g), "failures_not_saved": g.failed - len(g.failures)}
             row.pop("points"), row.pop("shares")
         return out
 
@@ -198,3 +226,10 @@ def _group(page: Page, view: CampaignView, g: GroupView) -> None:
     )
     again = "It ran to the same bits" if g.same else "It did NOT run to the same result"
     page.text(f"{again} from its saved files (state {g.state_hash}): {g.command}")
+    if saved := g.saved_failures():
+        page.text(f"{saved}.")
+    if g.failures:
+        page.table(
+            ["failed machine", "least margin", "reproduces", "model file", "command"],
+            [[f.name, f.least, f.same, f.file, f.command] for f in g.failures],
+        )
