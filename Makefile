@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 # Targets share one environment, and what takes long uses the cores itself.
 .NOTPARALLEL:
-.PHONY: help demo test test-all test-short test-pythons test-can mutants bench pictures docs release lint clean compiled
+.PHONY: help demo test test-all test-short test-pythons test-can mutants bench bench-all pictures docs release lint clean compiled
 
 # `make test PYTHON=python3.13`: another Python, in an environment of its own. Without it, the first that fits.
 PYTHON :=
@@ -71,9 +71,13 @@ test-can: $(READY_ALL)  ## only the tests on a real vcan0: this kernel's, that o
 mutants: $(READY_ALL) compiled  ## would the tests notice? changes the code in small ways, a sample; MUTANTS='--all' takes every one
 	@$(PY) -m tests.mutants $(MUTANTS)
 
-bench: $(READY_BENCH)  ## measure speed against C, python-control and pathsim
+bench: $(READY_BENCH)  ## measure speed against C, python-control and pathsim: some five minutes
 	@$(need_gcc)
 	@$(PY) -m benchmarks
+
+bench-all: $(READY_BENCH)  ## the same, and real time, the workbench, fleets, long logs, learning
+	@$(need_gcc)
+	@$(PY) -m benchmarks --all
 
 pictures: $(READY_ALL)  ## take every picture of the README and of docs anew (docs/pictures)
 	@$(need_chromium)

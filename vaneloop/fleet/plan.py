@@ -24,7 +24,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -44,7 +44,7 @@ from vaneloop.verbs.machine import Machine
 
 __all__ = [
     "LEAST", "Group", "Plan", "Varied", "as_options", "base_model", "draw", "files_of_plan", "group_machine", "groups",
-    "load_plan", "model_of", "scenario_of", "values_at", "varied",
+    "load_plan", "model_of", "scenario_of", "values_at", "varied", "varied_by",
 ]  # fmt: skip
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,60}")
@@ -209,20 +209,25 @@ def scenario_of(files: dict[str, str], g: Group) -> Scenario:
 
 def varied(plan: Plan, plant: Plant, source: str | Path) -> list[Varied]:
     """What a plan varies, with units and limits. Raises InputError for what the machine does not have."""
+    return varied_by(plan.vary, plant, source)
+
+
+def varied_by(vary: Mapping[str, str | Sequence[float]], plant: Plant, source: str | Path) -> list[Varied]:
+    """As `varied`, of names with ``"tolerance"`` or their limits."""
     known = {n.name: n for n in plant.nominal}
     effects = {f"{e}.{p.name}": p for e, effect in EFFECTS.items() if plant.kind in effect.kinds
                for p in plant.parameters_of(e).values()}  # fmt: skip
     out = []
-    for name, limits in plan.vary.items():
+    for name, limits in vary.items():
         at = f"{source}: vary: {name!r}"
         if name in known:
             n = known[name]
             if limits == "tolerance" and n.tolerance <= 0.0:
                 raise InputError(f"{at} has no tolerance in its table; give its limits [low, high] in {n.unit}")
-            low, high = (n.value - n.tolerance, n.value + n.tolerance) if limits == "tolerance" else limits
+            low, high = (n.value - n.tolerance, n.value + n.tolerance) if isinstance(limits, str) else limits
             out.append(Varied(name, n.unit, float(low), float(high), False))
         elif name in effects:
-            if limits == "tolerance":
+            if isinstance(limits, str):
                 raise InputError(f"{at} is an effect's parameter; give its limits [low, high] in {effects[name].unit}")
             out.append(Varied(name, effects[name].unit, float(limits[0]), float(limits[1]), True))
         else:
