@@ -88,9 +88,9 @@ def cells(r: Row) -> list[str]:
 
 def line(r: Row) -> str:
     """A row in one line."""
-    what, ours, peer, ratio, target, held, _ = cells(r)
+    what, ours, peer, ratio, target, held, note = cells(r)
     more = [peer and f"peer {peer}", ratio and f"ratio {ratio}", target and f"target {target}", held and f"held {held}"]
-    return f"{what}: {ours}" + "".join(f", {m}" for m in more if m)
+    return f"{what}: {ours}" + "".join(f", {m}" for m in more if m) + (f" ({note})" if note else "")
 
 
 def table(rows: Iterable[Row]) -> Table:

@@ -60,7 +60,11 @@ def test_each_row_is_printed_and_written_when_it_is_measured(
     assert "a: 1 s, peer 2 s, ratio 2.00, target >= 1, held yes" in printed and "b: 3 s" in more
     assert [r["what"] for r in said["rows"]] == ["a"] and [r["what"] for r in then["rows"]] == ["a", "b"]
     assert said["left"] == ["second"] and said["machine"] == {"cpu": "one"}
-    assert "first: not measured" in failed and last["rows"][2]["note"] == "OSError: no" and len(last["rows"]) == 3
+    assert (
+        "first: not measured (OSError: no)" in failed
+        and last["rows"][2]["note"] == "OSError: no"
+        and len(last["rows"]) == 3
+    )
     whole = json.loads(result.read_text())
     assert [r["what"] for r in whole["rows"]] == ["a", "b", "first", "c"] and whole["left"] == []
     assert re.search(r"c +4 s +NO", capsys.readouterr().out), "the table of all stands at the end"

@@ -142,6 +142,23 @@ def test_probability_worst_case_and_indices_where_the_truth_is_known(tmp_path: P
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("p", [1e-4, 1e-6])
+def test_subset_simulation_of_machines_covers_a_probability_that_is_known(tmp_path: Path, p: float) -> None:
+    """The bias of the potentiometer is uniform within -0.1..0.1 deg, and adds to the angle: it alone decides."""
+    plan, out = write(tmp_path, 0.1 - 0.2 * p, keys='saved = 3\nsampling = "subset"\nallowed = 0.01'), tmp_path / "run"
+    text = plan.read_text().replace("samples = 16\nsearch = 16\nsensitivity = 8", "samples = 400\nsearch = 0")
+    plan.write_text(text)
+    run(plan, out)
+    words = ["campaign", str(plan), "--out", str(out), "--json", str(tmp_path / "c.json"), "--report"]
+    assert main([*words, str(tmp_path / "c.html")]) == 0, "the interval's upper end is within what is allowed"
+    (g,) = json.loads((tmp_path / "c.json").read_text())["groups"]
+    assert g["low"] <= p <= g["high"] < 0.01 and g["same"] and g["failed"] <= 1
+    assert p / 10.0 < g["rare"]["probability"] < 10.0 * p and g["rare"]["runs"] < 4000
+    assert g["rare"]["worst"] and g["worst"][0] > 0.1 - 0.2 * p, "a machine that fails was found, and it reproduces"
+    assert "Subset simulation: failure probability" in (tmp_path / "c.html").read_text()
+
+
+@pytest.mark.slow
 def test_a_controller_that_crashes_is_a_failed_machine_and_not_the_end(tmp_path: Path) -> None:
     gcc = shutil.which("gcc")
     if gcc is None:

@@ -18,6 +18,7 @@ from scipy import optimize, stats
 pytest.importorskip("psutil", reason="the extra `fleet` is not installed")
 pytest.importorskip("duckdb", reason="the extra `fleet` is not installed")
 
+from hil.inject.margin import Margin
 from plant import Model
 from vaneloop.base.errors import InputError
 from vaneloop.fleet import campaign, trial
@@ -80,6 +81,10 @@ def test_a_plan_without_more_is_that_of_the_documentation() -> None:
         ({"confidence": 1.0}, False),
         ({"allowed": 0.0}, False),
         ({"allowed": 1.0}, False),
+        ({"samples": 250, "sampling": "subset"}, True),
+        ({"samples": 249, "sampling": "subset"}, False),
+        ({"samples": 10_000, "sampling": "subset"}, True),
+        ({"samples": 10_001, "sampling": "subset"}, False),
         ({"saved": 0}, True),
         ({"saved": 1000}, True),
         ({"saved": 1001}, False),
@@ -510,6 +515,99 @@ def test_a_search_finds_the_worst_machine_within_its_runs(monkeypatch: pytest.Mo
         assert answer["point"] == pytest.approx([0.62, 0.28], abs=0.02) and bowl(np.array(answer["point"])) < -0.2998
         found.append(machines.runs)
     assert found[0] == found[1] != found[2], "the same file gives the same runs"
+
+
+def test_the_levels_of_a_subset_simulation_run_in_lanes_and_alone_where_they_cannot(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of two quantities the sum of which fails with 2e-4: the levels go there, and the answer has the worst machine."""
+    limit = 2.0 - 0.02
+    machines = Machines(monkeypatch, lambda u: 0.5 * (limit - u.sum()))
+    lanes: list[int] = []
+
+    def in_lanes(files: Any, g: Any, quantities: Any, points: list[list[float]]) -> list[Any]:
+        lanes.append(len(points))
+        return [
+            trial.Alone("why") if i % 7 == 0 else [Margin("m", (s := 0.5 * (limit - sum(u))) >= 0.0, s, "deg", s)]
+            for i, u in enumerate(points)
+        ]
+
+    monkeypatch.setattr(trial, "in_lanes", in_lanes)
+    points = np.random.default_rng(3).random((300, 2)).tolist()
+    known = [(u, 0.5 * (limit - sum(u))) for u in points]
+    asked = {"subset": True, "among": ["m"], "known": known}
+    said = [trial._subset({}, Group("s", "c", "f"), TWO, asked, seed) for seed in (1, 1, 2)]
+    answer, same, other = said
+    assert answer["point"] == same["point"] != other["point"] and answer["subset"] == same["subset"]
+    found = answer["subset"]
+    p = np.prod([share for _, share, _ in found["levels"]])
+    assert found["reached"] and 2e-4 / 4.0 < p < 4.0 * 2e-4 and 3 <= len(found["levels"]) <= 5
+    assert 3 * found["runs"] == pytest.approx(sum(lanes), rel=0.2) and len(machines.runs) > sum(lanes) // 8
+    assert not answer["held"] and answer["margins"][0]["share"] < 0.0 and sum(answer["point"]) > limit
+    assert trial.is_answer(json.loads(json.dumps({"state_hash": None, "seen": [], **answer})))
+    monkeypatch.setattr(trial, "in_lanes", lambda files, g, q, of: [[Margin("m", True, 0.4, "", 0.4)]] * len(of))
+    still = trial._subset({}, Group("s", "c", "f"), TWO, asked | {"known": [(u, 0.4) for u in points]}, 1)
+    assert still["point"] == min(points) and still["subset"] == {
+        "levels": [(0.0, 0.0, 0.0)],
+        "reached": False,
+        "runs": 0,
+    }
+
+
+def sampled(plan: Plan, share: Callable[[Array], float]) -> dict[str, dict[str, Any] | None]:
+    """Answers to all samples of a plan by their names."""
+    return {
+        f"{i:06d}": {"point": x.tolist(), "held": (s := float(share(x))) >= 0.0, "seen": [], "state_hash": f"{s}",
+                     "margins": [claim("m", s), claim("idle", 0.1)]}
+        for i, x in enumerate(draw(plan, 2)[0])
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("fails", "taken"), [(0, 1), (24, 1), (25, 0), (250, 0)])
+def test_levels_are_taken_up_where_fewer_than_a_tenth_of_the_samples_fail(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: int, taken: int
+) -> None:
+    plan, _, run = begun(tmp_path, monkeypatch, 'samples = 250\nsearch = 0\nsampling = "subset"\nseed = 4')
+    a, _ = draw(plan, 2)
+    assert np.array_equal(a, draw(plan.model_copy(update={"sampling": "random"}), 2)[0]), "they are independent"
+    limit = sorted([*a[:, 0], 2.0])[fails]
+    monkeypatch.setattr(campaign, "_rows", lambda *of: sampled(plan, lambda u: u[0] - limit))
+    assert campaign.take_searches(plan, run) == taken and campaign.take_searches(plan, run) == 0
+    if taken:
+        said = json.loads((run.path / "trials" / "still.shipped.shipped" / "subset.json").read_text())
+        assert said["subset"] is True and said["among"] == ["m"]
+        assert said["known"] == [[x.tolist(), x[0] - limit] for x in a]
+
+
+@pytest.mark.parametrize(("reached", "allowed"), [(True, 1e-3), (True, 1e-5), (False, 1e-3), (False, None)])
+def test_a_campaign_says_a_small_probability_by_its_levels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reached: bool, allowed: float | None
+) -> None:
+    keys = 'samples = 250\nsearch = 0\nsampling = "subset"' + (f"\nallowed = {allowed}" if allowed else "")
+    plan, quantities, run = begun(tmp_path, monkeypatch, keys)
+    levels = [[0.3, 0.1, 0.2], [0.1, 0.1, 0.2], [0.0, 0.01 * reached, 0.1 * reached]]
+    value = -0.25 if reached else 0.02
+    extra = {
+        "point": [0.01, 0.99], "held": not reached, "margins": [claim("m", value), claim("idle", 0.1)],
+        "state_hash": f"{value}", "seen": [], "subset": {"levels": levels, "reached": reached, "runs": 1234},
+    }  # fmt: skip
+    samples = sampled(plan, lambda u: 0.5 + 0.1 * u[0])
+    found = {"[0-9]*.json": samples, "subset.json": {"subset": extra}}
+    monkeypatch.setattr(campaign, "_rows", lambda folder, g, of="[0-9]*.json": found.get(of, {}))
+    monkeypatch.setattr(campaign, "trial_once", lambda *of: extra)
+    view = campaign.judge(plan, quantities, run, lambda share: None)
+    (g,) = view.groups
+    assert g.rare is not None and g.rare.runs == 1234 and g.found_by == "level" and not g.by_search
+    assert (g.trials, g.failed, g.least) == (250, 0, value) and trial.is_answer(extra)
+    if reached:
+        assert g.probability == pytest.approx(1e-4) and g.low < 1e-4 < g.high < campaign.interval(0, 250, 0.95)[1]
+        assert "failure probability 0.0001, " in g.rare.text and "from 3 levels with 1,234 machines" in g.rare.text
+        assert g.requirements[0].fails
+    else:
+        assert (g.probability, g.low) == (0.0, 0.0) and "no machine failed, 0 to " in g.rare.text
+        assert g.high == min(g.rare.high, campaign.interval(0, 250, 0.95)[1]) < 0.02
+    assert view.passed(g) == (allowed is None if not reached and allowed != 1e-3 else g.high <= (allowed or 0.0))
+    assert view.json()["groups"][0]["rare"]["levels"][0] == {"margin": 0.3, "share": 0.1, "variation": 0.2}
 
 
 # ---- probability and requirements ------------------------------------------------------------------------------------

@@ -41,7 +41,7 @@ from vaneloop.identification.user_models.by_log import ByLog, Logs
 from vaneloop.identification.vane_chain.experiment import HEADS
 from vaneloop.identification.workflow import Diagnosis
 from vaneloop.pages.by_log import curves_by_log, log_by_log
-from vaneloop.pages.campaign import CampaignView, FailedMachine, GroupView, Requirement, campaign_page
+from vaneloop.pages.campaign import CampaignView, FailedMachine, GroupView, Rare, Requirement, campaign_page
 from vaneloop.pages.design import design_page
 from vaneloop.pages.diagnosis import compare_page, diagnosis_page, experiment_page, extended_page
 from vaneloop.pages.engine_test import engine_test_report
@@ -710,6 +710,9 @@ def test_a_campaign_that_is_broken() -> None:
               failures=[FailedMachine(f"00000{k}", -0.2, f"out/failed/00000{k}.toml", "vaneloop inject", k == 1)
                         for k in (1, 2)]),
         group("stop.soft.mine", by_search=False, same=False, total=[0.2, 1.2]),
+        group("rare.soft.mine", by_search=False, low=1e-5, high=1e-3,
+              rare=Rare(1.2e-4, 1e-5, 1e-3, 900, [{"margin": 0.1, "share": 0.1, "variation": 0.2},
+                                                  {"margin": 0.0, "share": 0.0012, "variation": 0.3}], True)),
     ])  # fmt: skip
     approve("campaign_broken", outline(campaign_page(view)))
 

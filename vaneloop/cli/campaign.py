@@ -82,8 +82,8 @@ def _command(args: argparse.Namespace) -> int:
     _work(args, folder, "running the trials")
     new = campaign.take_searches(plan, folder)
     if new:
-        terminal.say(args, f"searching for the worst case in {new} combinations")
-    _work(args, folder, "searching for the worst case")
+        terminal.say(args, f"searches for the worst case and subset simulations to take up: {new}")
+    _work(args, folder, "searching")
     with terminal.progress_bar(args, "running the worst cases again") as progress:
         view = campaign.judge(plan, quantities, folder, progress or (lambda fraction: None))
     _show(args, view, plan.search)
@@ -111,7 +111,7 @@ def _work(args: argparse.Namespace, folder: object, what: str) -> None:
 def _show(args: argparse.Namespace, view: CampaignView, search: int) -> None:
     rows = [
         [g.name, "passes" if view.passed(g) else "FAILS", f"{g.failed} of {g.trials}", f"{g.low:.2g} to {g.high:.2g}",
-         f"{g.least:.3g}", "search" if g.by_search else "sample", "yes" if g.reproduces else "NO"] for g in view.groups
+         f"{g.least:.3g}", g.found_by, "yes" if g.reproduces else "NO"] for g in view.groups
     ]  # fmt: skip
     interval = f"{100.0 * view.confidence:g} % interval"
     columns = ["combination", "", "failed", interval, "least margin", "found by", "reproduces"]
@@ -125,6 +125,8 @@ def _show(args: argparse.Namespace, view: CampaignView, search: int) -> None:
             terminal.say(args, f"on the lockstep bus, not in lanes: {n} of {g.trials} machines of {g.name}: {why}")
         if g.lost:
             terminal.say(args, f"without an answer: {g.lost} trials of {g.name}; vaneloop fleet status says what came")
+        if g.rare:
+            terminal.say(args, f"{g.name}: {g.rare.text}")
         if search and not g.runs:
             terminal.say(args, f"no search in {g.name}: too few of its trials have an answer")
         terminal.say(args, f"worst case: {g.command}")

@@ -1,6 +1,7 @@
 """A campaign: trials drawn from the tolerances, run on a run folder like the logs of a fleet, then searched and judged.
 
-    trials/GROUP/000012.json      a sample; b..., ab...: points of the sensitivity indices; search.json: the search
+    trials/GROUP/000012.json      a sample; b..., ab...: points of the sensitivity indices; search.json: the search;
+                                  subset.json: the levels of a subset simulation
     worst/GROUP/                  scenario, model and tables of the worst machine, and the command that runs it again
     failed/GROUP/                 the same files, and in machines/ a model file for each failed sample, the worst first
 
@@ -30,10 +31,11 @@ from vaneloop.fleet.files import digest_of, read_json, whole_json
 from vaneloop.fleet.folder import Folder, copies_of
 from vaneloop.fleet.kinds import TRIAL
 from vaneloop.fleet.plan import Group, Plan, Varied
+from vaneloop.fleet.probability import SHARE, Level, Subset, interval
 from vaneloop.fleet.sources import Source
 from vaneloop.fleet.tables import answers
 from vaneloop.fleet.trial import is_answer, model_at, moving, trial_once, worst_share
-from vaneloop.pages.campaign import CampaignView, FailedMachine, GroupView, Requirement
+from vaneloop.pages.campaign import CampaignView, FailedMachine, GroupView, Rare, Requirement
 
 __all__ = ["begin", "interval", "judge", "take_samples", "take_searches"]
 
@@ -75,12 +77,16 @@ def take_samples(plan: Plan, quantities: list[Varied], folder: Folder) -> int:
 
 
 def take_searches(plan: Plan, folder: Folder) -> int:
-    """Take up one search a group, from its worst samples; return how many are new."""
+    """Take up one search a group, from its worst samples, and the levels of its subset simulation, from all; return how
+    many are new.
+    """
     trials = []
     for g in plans.groups(plan):
         rows = [row for row in _rows(folder, g).values() if row is not None]
         among = moving(rows)
         known = [(row["point"], worst_share(row, among)) for row in rows]
+        if plan.sampling == "subset" and sum(share < 0.0 for _, share in known) < SHARE * len(known):
+            trials.append(_trial(folder, g, "subset", {"subset": True, "among": among, "known": known}))
         if plan.search and len(known) >= plans.LEAST:
             known.sort(key=lambda k: (k[1], k[0]))
             trials.append(_trial(folder, g, "search", {"search": plan.search, "among": among, "known": known[:KNOWN]}))
@@ -117,12 +123,6 @@ def _rows(folder: Folder, g: Group, pattern: str = "[0-9]*.json") -> dict[str, d
     return {name: answer if is_answer(answer := found.get(key)) else None for key, name in names.items()}
 
 
-def interval(failed: int, n: int, confidence: float) -> tuple[float, float]:
-    """Clopper-Pearson's interval of a failure probability from ``failed`` of ``n`` trials."""
-    found = scipy.stats.binomtest(failed, n).proportion_ci(confidence, method="exact")
-    return float(found.low), float(found.high)
-
-
 def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[float], None]) -> CampaignView:
     """What the campaign says. The worst case of each group is saved, and run again from its saved files."""
     files = {n: str(folder.path / f) for n, f in folder.job["options"]["files"].items()}
@@ -134,9 +134,15 @@ def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[
             raise InputError(f"{folder.path}: no trial of {g.name} came to an end; vaneloop fleet status says why")
         among = moving(done)
         search = _rows(folder, g, "search.json").get("search")
-        worst = min([*done, *([search] if search else [])], key=lambda r: (worst_share(r, among), r["point"]))
+        levels = _rows(folder, g, "subset.json").get("subset")
+        beyond = [r for r in (search, levels) if r]
+        worst = min([*done, *beyond], key=lambda r: (worst_share(r, among), r["point"]))
+        nearest = min(beyond, key=lambda r: worst_share(r, among), default=None)
+        rare = _rare(levels, plan.confidence, worst is levels)
         failed = sum(not r["held"] for r in done)
         low, high = interval(failed, len(done), plan.confidence)
+        if rare is not None:
+            low, high = rare.low, min(rare.high, high) if not rare.probability else rare.high
         by_search, agreed = worst is search, True
         if worst.get("alone") == "":  # a verdict from lanes is proved on the lockstep bus
             worst, lanes = trial_once(files, g, quantities, worst["point"]), worst
@@ -150,15 +156,24 @@ def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[
         first, total = _indices(plan, quantities, folder, g, rows, among)
         shown.append(GroupView(
             g.name, g.scenario, g.calibration, g.firmware, len(done), len(rows) - len(done), failed, low, high,
-            _requirements(done, search), shares, points, plans.values_at(quantities, worst["point"]), least, by_search,
+            _requirements(done, nearest), shares, points, plans.values_at(quantities, worst["point"]), least, by_search,
             runs, worst["seen"], worst["state_hash"], str(saved), command, same and agreed, first, total, alone,
-            failures,
+            failures, rare,
         ))  # fmt: skip
         told((k + 1) / len(all_groups))
     return CampaignView(
         plan.title, str(folder.path), folder.job["version"], [vars(q) for q in quantities], plan.confidence,
         plan.allowed, plan.sampling, plan.seed, shown,
     )  # fmt: skip
+
+
+def _rare(levels: dict[str, Any] | None, confidence: float, worst: bool) -> Rare | None:
+    """What the levels of a subset simulation say; None: there is none."""
+    if levels is None or not (said := levels.get("subset")):
+        return None
+    of = Subset([Level(*level) for level in said["levels"]], said["reached"], said["runs"])
+    low, high = of.interval(confidence)
+    return Rare(of.probability, low, high, of.runs, [vars(level) for level in of.levels], worst)
 
 
 def _worst_failed(rows: dict[str, dict[str, Any] | None], among: list[str], most: int) -> dict[str, dict[str, Any]]:
@@ -180,7 +195,9 @@ def _close(a: float | None, b: float | None) -> bool:
 
 
 def _requirements(done: list[dict[str, Any]], search: dict[str, Any] | None) -> list[Requirement]:
-    """Every claim over all trials: how often it was broken, its least and its median margin, and the search's."""
+    """Every claim over all trials: how often it was broken, its least and its median margin, and that of the worst
+    machine beyond them.
+    """
     by: dict[str, list[dict[str, Any]]] = {}
     for r in done:
         for m in r["margins"]:

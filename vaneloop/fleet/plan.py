@@ -67,6 +67,8 @@ class Choice(Table):
 
 
 LEAST = 5  # samples that a search begins with
+LEAST_OF_LEVEL = 250  # samples of a level of a subset simulation: chains begin from a tenth of them
+MOST_OF_LEVEL = 10_000  # one worker runs the levels
 
 
 class Plan(Table):
@@ -74,7 +76,8 @@ class Plan(Table):
 
     scenarios    names of shipped ones, or files
     samples      trials of each group (scenario, calibration, firmware), drawn uniformly between the limits
-    sampling     sobol (scrambled), or random (independent)
+    sampling     sobol (scrambled), random (independent), or subset (random, then levels of as many machines nearer and
+                 nearer to failing: `vaneloop.fleet.probability`)
     search       runs more in each group, in search of the worst case; 0: none
     sensitivity  base points of the sensitivity indices: so many times (parameters + 1) runs more; 0: none
     confidence   of the intervals
@@ -86,7 +89,7 @@ class Plan(Table):
     title: Annotated[str, Field(min_length=4)]
     scenarios: Annotated[list[str], Field(min_length=1)]
     samples: Annotated[int, Field(ge=4, le=100_000)] = 64
-    sampling: Literal["sobol", "random"] = "sobol"
+    sampling: Literal["sobol", "random", "subset"] = "sobol"
     search: Annotated[int, Field(ge=0, le=10_000)] = 40
     sensitivity: Annotated[int, Field(ge=0, le=10_000)] = 0
     saved: Annotated[int, Field(ge=0, le=1000)] = 20
@@ -124,6 +127,10 @@ class Plan(Table):
             n = getattr(self, key)
             if self.sampling == "sobol" and n & (n - 1):
                 raise ValueError(f"{key} (={n}) must be a power of two with sampling = 'sobol'")
+        if self.sampling == "subset" and not LEAST_OF_LEVEL <= self.samples <= MOST_OF_LEVEL:
+            raise ValueError(
+                f"samples (={self.samples}) must be in [{LEAST_OF_LEVEL}, {MOST_OF_LEVEL}] with sampling = 'subset'"
+            )
         n = len(stems) * len(self.calibration) * len(self.firmware)
         n *= self.samples + self.sensitivity * (len(self.vary) + 1)
         if n > MOST:

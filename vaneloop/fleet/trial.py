@@ -1,8 +1,9 @@
-"""What a campaign does with one trial: a scenario on one machine, judged; or a search for the worst machine.
+"""What a campaign does with one trial: a scenario on one machine, judged; a search for the worst machine; or the levels
+of a subset simulation.
 
 A trial is a file of JSON in the campaign's folder, which makes it an entry like a log of a fleet: ``group``, ``point``
 (in the unit cube) and, for a search, ``search`` (runs), ``among`` (claims that guide it) and ``known`` (points and
-their margins).
+their margins). The levels of a subset simulation have ``subset`` (true), ``among``, and as ``known`` all samples.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import scipy
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, StrictBool, ValidationError
 
 from hil.inject.any_controller import SHIPPED, expected_of_any, load_reactions
 from hil.inject.in_lanes import warm_up_lanes
@@ -29,6 +30,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.tables import Finite, Table
 from vaneloop.fleet.files import read_json
 from vaneloop.fleet.plan import Group, Varied, base_model, group_machine, model_of, scenario_of, values_at
+from vaneloop.fleet.probability import subset
 from vaneloop.fleet.together import Alone, in_lanes
 
 __all__ = ["is_answer", "model_at", "moving", "run_trial", "trial_once", "worst_share"]
@@ -43,11 +45,16 @@ def run_trial(path: str, options: dict[str, Any], run_folder: str, beside: Seque
     asked = _asked(path)
     files = {name: str(Path(run_folder) / f) for name, f in options["files"].items()}
     g, quantities = Group(*asked["group"]), [Varied(**q) for q in options["vary"]]
-    if "search" not in asked:
+    if _is_sample(asked):
         answer = _sample(files, g, quantities, asked, beside)
     else:
-        answer = _search(files, g, quantities, asked, int(options["seed"]))
+        of = _subset if asked.get("subset") else _search
+        answer = of(files, g, quantities, asked, int(options["seed"]))
     return {"verdict": "held" if answer["held"] else "failed", "answer": answer}
+
+
+def _is_sample(asked: dict[str, Any]) -> bool:
+    return "search" not in asked and not asked.get("subset")
 
 
 _kept: dict[str, dict[str, Any]] = {}  # answers that will be asked for: by what the file asks for, as JSON
@@ -64,7 +71,7 @@ def _sample(
         for other in beside:
             with suppress(InputError, OSError):  # asked for, it is told
                 next_one = _asked(other)
-                if next_one["group"] == asked["group"] and "search" not in next_one:
+                if next_one["group"] == asked["group"] and _is_sample(next_one):
                     all_asked[json.dumps([files, next_one], sort_keys=True)] = next_one
         found = in_lanes(files, g, quantities, [a["point"] for a in all_asked.values()])
         for name, one, margins in zip(all_asked, all_asked.values(), found, strict=True):
@@ -91,6 +98,14 @@ class _Margin(BaseModel):
     share: Finite | None
 
 
+class _Subset(BaseModel):
+    """Levels of a subset simulation in an answer: `vaneloop.fleet.probability.Subset`."""
+
+    levels: Annotated[list[tuple[Finite, Finite, Finite]], Field(min_length=1)]
+    reached: bool
+    runs: int
+
+
 class _Answer(BaseModel):
     """The answer to a trial, as a campaign counts it."""
 
@@ -101,6 +116,7 @@ class _Answer(BaseModel):
     seen: list[str]
     runs: int = 0
     alone: str | None = None  # why it did not run in lanes; empty: it did
+    subset: _Subset | None = None
 
 
 class _Asked(Table):
@@ -110,6 +126,7 @@ class _Asked(Table):
     name: str = ""
     point: list[Finite] = []
     search: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    subset: StrictBool = False
     among: list[str] = []
     known: list[tuple[list[Finite], Finite]] = []
 
@@ -242,6 +259,33 @@ def _search(
         pass
     answer = best[1] if best[0] < seen[start[0]] else trial_once(files, g, quantities, list(start[0]))
     return {**answer, "runs": runs, "from": seen[start[0]]}
+
+
+def _subset(
+    files: dict[str, str], g: Group, quantities: list[Varied], asked: dict[str, Any], seed: int
+) -> dict[str, Any]:
+    """Run level after level from the samples that are known, side by side in lanes where they can; answer with the
+    machine of the least margin. The same file gives the same runs.
+    """
+    points, shares = (list(of) for of in zip(*asked["known"], strict=True))
+    start = min(zip(shares, points, strict=True))
+    best: list[Any] = [start[0], None]
+
+    def least(x: np.ndarray) -> np.ndarray:
+        of = x.tolist()
+        found = in_lanes(files, g, quantities, of)
+        answers = [trial_once(files, g, quantities, point) if isinstance(margins, Alone) else _in_lanes(margins, point)
+                   for margins, point in zip(found, of, strict=True)]  # fmt: skip
+        out = [worst_share(answer, asked["among"]) for answer in answers]
+        k = int(np.argmin(out))
+        if out[k] < best[0]:
+            best[:] = [out[k], answers[k]]
+        return np.array(out)
+
+    found = subset(least, np.array(points), np.array(shares), seed)
+    answer = best[1] or trial_once(files, g, quantities, start[1])
+    levels = [(level.margin, level.share, level.variation) for level in found.levels]
+    return {**answer, "subset": {"levels": levels, "reached": found.reached, "runs": found.runs}}
 
 
 def _warm_up(options: dict[str, Any], run_folder: str) -> None:

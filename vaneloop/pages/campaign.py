@@ -11,7 +11,7 @@ from vaneloop.pages.figures import Line, Panel, overlay, ranking
 from vaneloop.pages.page import Page
 from vaneloop.pages.series import distribution
 
-__all__ = ["CampaignView", "FailedMachine", "GroupView", "Requirement", "campaign_page"]
+__all__ = ["CampaignView", "FailedMachine", "GroupView", "Rare", "Requirement", "campaign_page"]
 
 DIGITS = 6  # of limits: a tolerance may be a thousandth
 
@@ -56,6 +56,33 @@ class FailedMachine:
 
 
 @dataclass(frozen=True)
+class Rare:
+    """A small failure probability by subset simulation, with its interval (`vaneloop.fleet.probability`).
+
+    probability   0: no machine failed; then the interval ends at what the last level is sure of
+    runs          machines beyond the samples
+    levels        margin (a share), share of the machines of the level before, its coefficient of variation
+    worst         whether the worst machine is one of its
+    """
+
+    probability: float
+    low: float
+    high: float
+    runs: int
+    levels: list[dict[str, float]]
+    worst: bool
+
+    @property
+    def text(self) -> str:
+        """The result in one sentence."""
+        said = f"failure probability {self.probability:.3g}" if self.probability else "no machine failed"
+        return (
+            f"Subset simulation: {said}, {self.low:.2g} to {self.high:.2g}, from {len(self.levels)} levels with "
+            f"{self.runs:,} machines beyond the samples"
+        )
+
+
+@dataclass(frozen=True)
 class GroupView:
     """One scenario with one calibration and one firmware.
 
@@ -68,6 +95,7 @@ class GroupView:
     first, total           sensitivity indices of the least margin; empty: none
     alone                  samples that ran on the lockstep bus and not in lanes, by the reason
     failures               failed samples that are saved, the worst first
+    rare                   the probability by subset simulation; None: it is counted
     """
 
     name: str
@@ -95,6 +123,17 @@ class GroupView:
     total: list[float]
     alone: dict[str, int] = field(default_factory=dict)
     failures: list[FailedMachine] = field(default_factory=list)
+    rare: Rare | None = None
+
+    @property
+    def probability(self) -> float:
+        """Estimate of the failure probability."""
+        return self.rare.probability if self.rare else self.failed / self.trials
+
+    @property
+    def found_by(self) -> str:
+        """What the worst machine is one of."""
+        return "search" if self.by_search else "level" if self.rare and self.rare.worst else "sample"
 
     @property
     def reproduces(self) -> bool:
@@ -166,13 +205,15 @@ def campaign_page(view: CampaignView, command: str = "") -> Page:
         "Result",
         f"Failure probability of a machine drawn uniformly from the tolerances, with its {100.0 * view.confidence:g} % "
         "interval (Clopper-Pearson, which takes the samples as independent; points of a Sobol sequence are distributed "
-        "more evenly than that). The least margin is a share: 1 is the best, 0 is at the limit, below 0 is broken.",
+        "more evenly than that)"
+        + (", or by subset simulation where that is said below" if any(g.rare for g in view.groups) else "")
+        + ". The least margin is a share: 1 is the best, 0 is at the limit, below 0 is broken.",
     )
     page.table(
         ["combination", "passes", "machines", "without answer", "failed", "probability", "low", "high", "least margin",
          "found by"],
-        [[g.name, view.passed(g), g.trials, g.lost, g.failed, g.failed / g.trials, g.low, g.high, g.least,
-          "search" if g.by_search else "sample"] for g in view.groups],
+        [[g.name, view.passed(g), g.trials, g.lost, g.failed, g.probability, g.low, g.high, g.least,
+          g.found_by] for g in view.groups],
     )  # fmt: skip
     page.section("What was varied", "Each uniformly and independently of the others, between these limits.")
     rows = [[q["name"], q["low"], q["high"], q["unit"]] for q in view.varied]
@@ -196,6 +237,16 @@ def _group(page: Page, view: CampaignView, g: GroupView) -> None:
                          for r in g.requirements])  # fmt: skip
     for why, n in g.alone.items():
         page.text(f"{n} of {g.trials} machines ran one by one on the lockstep bus, not in lanes: {why}.")
+    if g.rare:
+        page.text(
+            f"{g.rare.text}. A level holds the share of the machines before it that come as near to failing. Its "
+            "coefficient of variation is from the autocorrelation of its chains; the interval adds those of all "
+            "levels, an upper bound. Failures that no chain came near are not seen."
+        )
+        page.table(
+            ["level", "least margin at or below", "share", "coefficient of variation"],
+            [[k, of["margin"], of["share"], of["variation"]] for k, of in enumerate(g.rare.levels, 1)],
+        )
     names = [q["name"] for q in view.varied]
     if g.total:
         total, first = np.round(g.total, 3).tolist(), np.round(g.first, 3).tolist()
@@ -216,7 +267,9 @@ def _group(page: Page, view: CampaignView, g: GroupView) -> None:
             [[names[k], first[k], total[k]] for k in order],
         )
     how = f"by the search ({g.runs} runs)"
-    if not g.by_search:
+    if g.found_by == "level":
+        how = "in the levels of the subset simulation"
+    elif not g.by_search:
         how = f"among the samples; {f'the search ({g.runs} runs) found none' if g.runs else 'no search was made'}"
     page.text(f"Worst machine, found {how}; least margin {g.least:.4g}." + "".join(f" Seen: {s}." for s in g.seen))
     page.table(
