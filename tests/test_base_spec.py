@@ -256,6 +256,29 @@ def test_stops_make_their_virgin_curve(columns: int | None) -> None:
     assert hysteresis.stops_of("stops_of_n_r") == "n_r" and hysteresis.stops_of("n_r") == ""
 
 
+@pytest.mark.parametrize("samples", [0, 1, 2, 8, 9, 10, 400])
+def test_stops_give_the_same_bits_sample_by_sample_and_on_a_whole_log(samples: int) -> None:
+    rng = np.random.default_rng(samples)
+    course, weights = np.cumsum(rng.normal(size=samples)), rng.normal(size=(hysteresis.RADII, 1))
+    s, gives = np.zeros((hysteresis.RADII, 1)), np.zeros(samples)
+    for k in range(1, samples):
+        gives[k] = hysteresis.slip(s, 0, 0, course[k] - course[k - 1], weights, 0, 3.0)
+    assert np.array_equal(hysteresis.slipped(course, 3.0, weights[:, 0]), gives)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "points"), [(0.0, 1.0, 257), (-3.3, 7.1, 1025), (0.0, 3.0, 2), (1e6, 1e6 + 1e-3, 257)]
+)
+def test_on_an_even_grid_a_curve_has_the_bits_that_a_search_finds(low: float, high: float, points: int) -> None:
+    rng = np.random.default_rng(points)
+    grid, table = np.linspace(low, high, points), rng.normal(size=points)
+    spread = rng.uniform(low - 0.1 * (high - low), high + 0.1 * (high - low), 2_000)
+    beside = [np.nextafter(grid, end) for end in (-np.inf, np.inf)]
+    x = np.concatenate([spread, grid, *beside, [np.nan, np.inf, -np.inf]])
+    want = np.interp(x, grid, table)
+    assert curve.on_even_grid(x, grid, table) == pytest.approx(want, rel=1e-14, abs=1e-14, nan_ok=True)
+
+
 LOW, HIGH = np.array([10.0, -1.0]), np.array([20.0, 1.0])
 
 

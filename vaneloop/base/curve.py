@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from vaneloop.base.compiled import inlined
+from vaneloop.base.compiled import compiled_free, inlined
 
 __all__ = [
     "DEGREE",
@@ -17,6 +17,7 @@ __all__ = [
     "SIDE",
     "between_points",
     "on_even",
+    "on_even_grid",
     "on_grid",
     "on_table",
     "splines",
@@ -48,6 +49,30 @@ def on_even(x: float, low: float, per: float, table: np.ndarray) -> float:
         return table[last]
     k = int(z)
     return table[k] + (z - k) * (table[k + 1] - table[k])
+
+
+@compiled_free
+def on_even_grid(x: np.ndarray, grid: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """``np.interp(x, grid, table)`` to the last bit, of a ``grid`` that is even but for rounding: where a value stands
+    in it is reckoned, not searched.
+    """
+    out, last = np.empty(len(x)), len(grid) - 1
+    per = last / (grid[last] - grid[0])
+    for i in range(len(x)):
+        v = x[i]
+        if not v > grid[0]:
+            out[i] = table[0] if v <= grid[0] else v  # NaN stays NaN
+        elif v >= grid[last]:
+            out[i] = table[last]
+        else:
+            k = min(int((v - grid[0]) * per), last - 1)
+            while grid[k] > v:
+                k -= 1
+            while grid[k + 1] <= v:
+                k += 1
+            slope = (table[k + 1] - table[k]) / (grid[k + 1] - grid[k])
+            out[i] = slope * (v - grid[k]) + table[k]
+    return out
 
 
 @inlined

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from vaneloop.base.curve import FINE, POINTS
+from vaneloop.base.curve import FINE, POINTS, on_even_grid
 from vaneloop.base.forms import Form
 from vaneloop.identification.settings import AT_ONCE
 from vaneloop.identification.subsystem import Array
@@ -100,7 +100,8 @@ class Curve:
         table, half, place = self.parts(row)
         if self.quantity.startswith(STOPS):
             return of_stops(q, self.low, self.high, table)
-        c = np.interp(q, np.linspace(self.low, self.high, len(table)), table)
+        q, table = np.ascontiguousarray(q, dtype=float), np.ascontiguousarray(table, dtype=float)
+        c = on_even_grid(q, np.linspace(self.low, self.high, len(table)), table)
         return c + half * np.sign(q - place) if half else c
 
     @property
