@@ -63,8 +63,8 @@ OF_SOURCES = ("structure", "writers", "child", "exit_codes", "extras", "settings
 # is left for the end, when the others have nothing more to do.
 LONG: tuple[tuple[str, ...], ...] = (
     ("real_data",), ("docs",), ("web",), ("help",), ("native",), ("fuzz",), ("logs_fuzz",), OF_ONES_OWN, WITH_THE_RIG,
-    ("record",), ("reading",), ("fleet_report",), ("fleet_run",), ("realtime",), ("design",), ("effects",),
-    ("search_commands",), OF_SOURCES, ("fmu",), ("kept",), ("held",), ("learn_turns",),
+    ("record",), ("reading",), ("fleet_report",), ("add_an_effect",), ("growth",), ("fleet_run",), ("realtime",),
+    ("design",), ("effects",), ("search_commands",), OF_SOURCES, ("fmu",), ("kept",), ("held",), ("learn_turns",),
 )  # fmt: skip
 
 
@@ -87,9 +87,10 @@ def longest_first(modules: list[str], workers: int) -> list[int]:
     return [i for share in shares for i in share] + rest
 
 
+@pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Skip what needs a CAN interface where there is none, except where the run is there for it (tests/vcan/run.py);
-    give each worker of xdist long tests to begin with.
+    give each worker of xdist long tests to begin with, of those that ``-m`` and ``-k`` leave: these are shared out.
     """
     if own := getattr(config, "workerinput", None):
         modules = [getattr(getattr(item, "module", None), "__name__", "") for item in items]

@@ -6,7 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests import costs
+import pytest
+
+from tests import conftest, costs
 from tests.conftest import LONG, ROOT, longest_first
 
 CASE = (
@@ -62,3 +64,11 @@ def test_each_worker_begins_with_long_modules_and_every_test_is_run_once() -> No
             modules[order[k * len(modules) // workers]] not in ("tests.test_a", "tests.test_c")
             for k in range(min(workers, 3))
         )
+
+
+def test_what_is_shared_out_among_workers_are_the_tests_that_are_run(pytestconfig: pytest.Config) -> None:
+    """An order of all tests, of which a mark then takes away nine in ten, has the long ones in the midst of a share."""
+    last_first = pytestconfig.hook.pytest_collection_modifyitems.get_hookimpls()
+    ours = next(k for k, one in enumerate(last_first) if one.function is conftest.pytest_collection_modifyitems)
+    marks = next(k for k, one in enumerate(last_first) if one.plugin_name == "mark")
+    assert ours < marks, "called before -m and -k have left out what is not run"
