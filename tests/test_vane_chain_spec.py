@@ -4,6 +4,7 @@ to the search, each against a closed form or a simulated machine.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,23 +13,42 @@ import pytest
 
 from controller import load_calibration
 from hil.logs import Channel, Log, LogError
+from hil.logs.notes import Note
 from hil.loop.lockstep import Stimulus, lockstep
-from plant import build_plant
-from plant.curve import PLACES
+from plant import Model, build_plant
+from plant.curve import KNOWN, PLACES, QUANTITIES
 from plant.effects import EFFECTS
+from plant.model import Learned
+from plant.stages.linkage import speed_reach
+from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.subsystem import Array, Parameter, Stage
 from vaneloop.identification.unmodelled.regressors import Quantity
 from vaneloop.identification.user_models.terms import COLUMN
-from vaneloop.identification.vane_chain import experiment
+from vaneloop.identification.vane_chain import candidates, demand, experiment
 from vaneloop.identification.vane_chain.actuator import _quadratic_drag
-from vaneloop.identification.vane_chain.alignment import Late, _explains, _shifted, aligned, driving, late_vanes
+from vaneloop.identification.vane_chain.alignment import (
+    Late,
+    _explains,
+    _servo,
+    _shifted,
+    aligned,
+    demand_of,
+    driving,
+    late_in_controller,
+    late_vanes,
+)
 from vaneloop.identification.vane_chain.candidates import (
+    LAGGED,
+    NEAR,
     VaneChainCandidates,
     _says_more,
+    curve_effect,
     remade,
     reversals,
     room_for,
+    with_laws,
     without_laws,
 )
 from vaneloop.identification.vane_chain.chain import (
@@ -43,6 +63,7 @@ from vaneloop.identification.vane_chain.current import (
     BEFORE,
     SAMPLED,
     SLOW_CURRENTS,
+    LowPass,
     _above_noise,
     _calibrated,
     _smoothed,
@@ -51,10 +72,26 @@ from vaneloop.identification.vane_chain.current import (
     law_of,
     other_current,
     samples_of,
+    servo_law,
+    without_noise,
 )
-from vaneloop.identification.vane_chain.demand import _direction_known
+from vaneloop.identification.vane_chain.demand import (
+    _by_noise,
+    _direction_known,
+    _other_noise,
+    demand_stage,
+    own_demand_stage,
+)
+from vaneloop.identification.vane_chain.engine import engine_stage
 from vaneloop.identification.vane_chain.linkage import _cross_talk, _crossed, _late_recorder
-from vaneloop.identification.vane_chain.parameters import FREE, _starts, declared, like_temperature, like_time
+from vaneloop.identification.vane_chain.parameters import (
+    ALL_PLACES,
+    FREE,
+    _starts,
+    declared,
+    like_temperature,
+    like_time,
+)
 from vaneloop.identification.vane_chain.resample import (
     Gaps,
     Grid,
@@ -69,9 +106,12 @@ from vaneloop.identification.vane_chain.resample import (
     since,
     stretches,
 )
+from vaneloop.identification.vane_chain.servo import servo_stage
+from vaneloop.identification.vane_chain.subsystem_data import Driven
 
 CALIBRATION = load_calibration()
 LATE, TICK = 0.04, 1e-3  # s
+VANES_SET = set(VANES)
 NATS, RIVAL_SPREADS = 12.0, 0.3  # docs/settings.md
 
 
@@ -666,3 +706,681 @@ def test_excerpts_of_a_stage_say_the_same_as_the_whole(chain: Chain) -> None:
         assert 0.4 < counts.mean() < 1.0 and np.array_equal(part.measured[counts], stage.measured[:, at][counts])
         e = part.run(part.neutral()[None])[0] - part.measured
         assert np.all(rms(part, e) < 1.6 * np.asarray(stage.floor))
+
+
+# ---- clocks of a simulated machine
+
+
+def servo_of(late: float, late_stroke: float = 0.0, passed: LowPass | None = None, last: bool = False) -> Stage:
+    """A servo subsystem whose current follows the firmware's law, of a demand and a stroke that stand late in the log
+    by so much (s), or of a demand that has not passed what stroke and current have.
+    """
+    rows, none, noise = 2000, np.zeros(2000), 1e-3
+    t = 0.01 * np.arange(rows)
+    x = 20.0 + 5.0 * np.sin(0.9 * t) + np.sin(3.1 * t + 1.0)
+    x_dem = np.interp(t, t[::7], 20.0 + 6.0 * np.sin(0.8 * t[::7]) + np.cos(2.3 * t[::7]))
+    law = law_of(x_dem, none, CALIBRATION, behind=passed or LowPass(late=-late))
+    law = law + law_of(none, np.interp(t + late_stroke, t, x), CALIBRATION)
+    c = {
+        "x_dem": x_dem, "x_lvdt": x, "stroke": x, "missing": none, "law": law_of(x_dem, x, CALIBRATION),
+        "i_cmd": (law[:, -1] if last else law.mean(axis=1)) + noise * white(1, rows),
+        "law_error": noise * white(2, rows, 3),
+    }  # fmt: skip
+    stage = servo_stage(Driven(t, c, build_plant(), CALIBRATION, ("i_cmd",), np.ones(rows, dtype=bool), ()))
+    stage.floor = np.array([1.05 * noise])
+    return stage
+
+
+@pytest.mark.parametrize(
+    ("late", "late_stroke", "last"),
+    [(0.0, 0.0, False), (0.02, 0.0, False), (-0.013, 0.0, False), (0.004, -0.017, False), (0.02, 0.0, True)],
+)
+def test_a_servo_s_demand_and_stroke_that_stand_late_are_told(late: float, late_stroke: float, last: bool) -> None:
+    found = {one.channels: one.seconds for one in _servo(servo_of(late, late_stroke, last=last))}
+    wanted = {("x_dem",): late, ("x_lvdt",): late_stroke}
+    assert found == pytest.approx({c: v for c, v in wanted.items() if v}, abs=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("passed", "said"),
+    [
+        (LowPass("mean", 0.015), "a mean over 30 ms"),
+        (LowPass("first order", 0.02, 0.004), "a low-pass of first order of 7.96 Hz"),
+        (LowPass("second order", 0.02), "a low-pass of second order of 11.3 Hz"),
+    ],
+)
+def test_a_low_pass_that_the_analogue_channels_have_passed_is_told_by_kind_and_corner(
+    passed: LowPass, said: str
+) -> None:
+    (one,) = _servo(servo_of(0.0, passed=passed))
+    assert one.channels == ("x_dem",) and one.passed.text() == said
+    assert (one.passed.delay, one.passed.late) == pytest.approx((passed.delay, passed.late), abs=1e-4)
+    assert one.seconds == pytest.approx(-passed.delay - passed.late, abs=1e-4)
+    assert one.text() == (
+        f"x_dem: stand {1e3 * abs(one.seconds):.3g} ms early in the file, because the analogue channels have passed "
+        f"{said}; moved"
+    )
+    assert demand_of([one, Late(("n_r",), 0.1)]) == (one.passed, (Late(("n_r",), 0.1),))
+
+
+def moved_by(log: Log, **late: float) -> Log:
+    return Log("moved", {k: replace(c, t=c.t + late.get(k, 0.0)) for k, c in log.channels.items()})
+
+
+@pytest.mark.parametrize(
+    ("late", "found"),
+    [
+        ({"x_dem": 0.02}, {"servo": {"x_dem": 20.0}, "demand": {"n_r": -20.0}}),
+        ({"n_r": 0.03}, {"demand": {"n_r": 30.0}, "engine": {"n_dem": -30.0}}),
+        ({"n_r": -0.03}, {"engine": {"n_dem": 30.0}}),  # an answer of the demand before its cause: none of a recorder
+        (
+            {"x_dem": 0.03, "n_dem": -0.02},
+            {"servo": {"x_dem": 30.0}, "demand": {"n_r": -30.0}, "engine": {"n_dem": -20.0}},
+        ),
+    ],
+)
+def test_channels_that_a_recorder_has_late_are_told_in_each_subsystem(
+    machine_log: Log, late: dict[str, float], found: dict[str, dict[str, float]]
+) -> None:
+    stages = [s for s in build_chain_as_it_is(moved_by(machine_log, **late)).stages if s.name != "linkage"]
+    of = late_in_controller(stages)
+    assert of.get("actuator") == of.get("servo") and "linkage" not in of
+    got = {
+        name: {one.channels[0]: 1e3 * one.seconds for one in all_of}
+        for name, all_of in of.items()
+        if name != "actuator"
+    }
+    assert set(got) == set(found)
+    for name, of_stage in found.items():
+        assert got[name] == pytest.approx(of_stage, abs=1.0), name
+
+
+def build_chain_as_it_is(log: Log) -> Chain:
+    return build_chain(log, grid=grid_of(log), pieces=[(0, grid_of(log).rows)])
+
+
+# ---- curves that nobody named
+
+
+@pytest.fixture(scope="module")
+def on_actuator(chain: Chain) -> tuple[VaneChainCandidates, dict[str, Any]]:
+    source = VaneChainCandidates(chain.stage("actuator"), others=chain.stages)
+    return source, {c.name: c for c in source.candidates(source.stage((), ()).neutral())}
+
+
+def test_every_place_of_a_subsystem_has_curves_of_all_that_says_something_there(
+    on_actuator: tuple[VaneChainCandidates, dict[str, Any]], chain: Chain
+) -> None:
+    source, found = on_actuator
+    driven = source.driven
+    places = {f"{p.at} {p.how}" for p in ALL_PLACES if "actuator" in p.stages and driven.machine.kind in p.kinds}
+    assert {f"{c.at} {c.how}" for c in found.values()} == places
+    for name, c in found.items():
+        word = {"adds": "curve", "times": "gain"}[c.how]
+        assert name == f"{c.at}.{word}_of_{c.quantity.name}" and ALL_PLACES[c.place].at == c.at
+        assert c.mean != c.quantity.stops and c.near == (c.quantity.name in NEAR.get(c.at, ()))
+        assert len(c.quantity.visited) == np.isfinite(source.all.measured).any(axis=0).sum()
+    of = {at: {c.quantity.name for c in found.values() if f"{c.at} {c.how}" == at} for at in places}
+    assert of["sensors.lvdt adds"] == {"time"}  # a constant pressure tells nothing
+    assert of["valve.opening adds"] == {"i_cmd"} and "stops_of_i_cmd" in of["valve.current adds"]
+    lags = sorted(q for q in of["actuator.load adds"] if q.startswith("i_cmd_lagged"))
+    # of 3 samples and of an eighth of the log: a sixth, a half and five sixths of the way, in logarithms
+    assert lags == ["i_cmd_lagged_by_1390_ms", "i_cmd_lagged_by_300_ms", "i_cmd_lagged_by_64600_us"]
+    assert not any(VANES_SET & of_place or "x_dem" in of_place for of_place in of.values())
+    # a usual curve is as large as a constant that moves the stage by its error, where that is less than usual
+    theta = source.all.neutral()[: len(source.all.parameters)]
+    judge = LeastSquaresProblem(source.stage((), ()), source.floor)
+    error = np.sqrt(np.sum(judge.errors(judge.fit((), theta, 1).theta[None]) ** 2) / judge.n)
+    for at in ("valve.current adds", "actuator.load adds", "actuator.flow_gain times"):
+        c = next(c for c in found.values() if f"{c.at} {c.how}" == at and not c.quantity.stops)
+        with_it = LeastSquaresProblem(source.stage((), ((c.placed(), c.effect(1.0)),)), source.floor)
+        thetas = np.repeat(with_it.stage.neutral()[None], 2, axis=0)
+        thetas[1, len(theta)] = c.size
+        still, by = with_it.errors(thetas)
+        assert np.sqrt(np.sum((by - still) ** 2) / with_it.n) == pytest.approx(error, rel=0.02), at
+    (slips,) = (c for c in found.values() if c.quantity.stops)
+    assert (slips.size, slips.quantity.unit) == (1.0, "mA") and slips.basis.low == 0.0
+    i = driven.columns["i_cmd"]
+    assert slips.basis.high == pytest.approx(0.5 * np.ptp(i))
+
+
+def test_curves_of_each_subsystem_are_of_what_drives_it(chain: Chain) -> None:
+    names = {}
+    for stage in ("servo", "engine", "demand"):
+        source = VaneChainCandidates(chain.stage(stage))
+        found = source.candidates(source.all.neutral()[: len(source.all.parameters)])
+        names[stage] = {c.quantity.name.split("_lagged")[0] for c in found}
+        assert {c.at.split(".")[0] for c in found} == {{"demand": "controller"}.get(stage, stage)}
+        assert {c.quantity.name.split("_lagged")[0] for c in found if "_lagged" in c.quantity.name} == set(
+            LAGGED[stage]
+        )
+    assert names["engine"] == {"n_r", "n_dem", "time"} == names["demand"]
+    assert names["servo"] == {
+        "i_cmd",
+        "x_lvdt",
+        "speed_of_x_lvdt",
+        "n_r",
+        "time",
+        "n_dem",
+        "x_dem",
+        *candidates.OF_STROKE,
+    }
+    source = VaneChainCandidates(chain.stage("linkage"))
+    two = source._late(source.driven, "x_lvdt", np.ones(len(source.all.t), dtype=bool))
+    again = two[0].slower(3.0)
+    tau = [float(q.name.split("_")[-2]) for q in two]
+    assert tau == [64600.0, 300.0, 1390.0] and again is not None and again.name == "x_lvdt_lagged_by_194_ms"
+    assert two[0].slower(200.0) is None and two[0].slower(0.1) is None  # longer than a log can tell, and shorter
+    assert source._late(source.driven, "p_s", np.ones(len(source.all.t), dtype=bool)) == []
+    assert source._stops(source.driven, "t_oil", np.ones(len(source.all.t), dtype=bool)) is None
+    sine = source._stops(source.driven, "x_lvdt", np.arange(len(source.all.t)) > 1800)
+    assert sine is not None and sine.visited[-1] <= 0.5 * np.ptp(source.driven.columns["x_lvdt"])
+
+
+def test_a_long_log_is_learned_on_an_excerpt_and_judged_on_the_rest(
+    chain: Chain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, n in (
+        ("MOST_SAMPLES", 1200),
+        ("QUICK_SAMPLES", 600),
+        ("LEARN_PIECE", 300),
+        ("FREE_PIECE", 600),
+        ("SHORT_PIECE", 100),
+    ):
+        monkeypatch.setattr(candidates, name, n)
+    for name, piece, short in (("actuator", 300, 100), ("linkage", 600, 300)):
+        stage = chain.stage(name)
+        source = VaneChainCandidates(stage, test=stage)
+        assert source.tests == {"rest of the log", "test"} and source.all is stage
+        assert np.array_equal(stage.t[~source.rest], source.whole.t) and len(source.whole.t) == pytest.approx(
+            1200, abs=piece
+        )
+        for part, long in ((source.whole, piece), (source.small, short)):
+            pieces = np.split(part.t, np.flatnonzero(np.diff(part.t) > 0.011) + 1)
+            assert all(len(p) % long == 0 for p in pieces)
+        assert len(source.small.t) == pytest.approx(600, abs=short)
+        source.in_grains(0.25)
+        assert source.whole.grain == source.small.grain == 0.25
+        assert len(source.stage((), ()).t) == len(source.whole.t) and len(source.stage((), (), True).t) == len(
+            source.small.t
+        )
+        theta = source.stage((), ()).neutral()
+        errors = source.errors((), theta)
+        assert list(errors) == ["log", "rest of the log", "test"]
+        log, rest, test = (np.isfinite(e) for e in errors.values())
+        assert not (log & rest).any() and np.array_equal(log | rest, test)
+        assert not log[:, source.rest].any() and not rest[:, ~source.rest].any()
+        assert np.nanstd(errors["test"]) == pytest.approx(1.0, abs=0.35)
+        on_whole = LeastSquaresProblem(source.stage((), ()), source.floor)
+        assert np.array_equal(on_whole.floor, stage.floor)
+        q = source.driven.quantity("i_cmd")
+        some: Any = SimpleNamespace(
+            quantity=SimpleNamespace(stops=False, name="i_cmd"), basis=SimpleNamespace(reaches=lambda v: v > 0.0)
+        )
+        within = source.within(some)
+        assert list(within) == ["rest of the log", "test"] and all(np.array_equal(w, q > 0.0) for w in within.values())
+        some.quantity.name = "nothing"
+        assert source.within(some) == {}
+        some.quantity = SimpleNamespace(stops=True, name="i_cmd")
+        assert source.within(some) == {}
+        (course,) = source.courses((), theta)
+        counts = np.isfinite(stage.measured)
+        own = (stage.run(stage.neutral()[None])[0] - stage.measured) / stage.floor[:, None]
+        assert np.array_equal(course.t, stage.t) and not course.error[~counts].any()
+        assert course.error[counts] == pytest.approx(own[counts])
+        assert len(course.drivers) == 5
+    plain = VaneChainCandidates(chain.stage("servo"))  # has no excerpts
+    assert plain.whole is plain.small is chain.stage("servo") and plain.tests == frozenset()
+    assert list(plain.errors((), plain.stage((), ()).neutral())) == ["log"]
+
+
+def learned(at: str, how: str, of: str, low: float, high: float, *values: float) -> Learned:
+    return Learned(how=how, at=at, of=of, low=low, high=high, values=list(values),
+                   knots=[low] * 4 + [high] * 4)  # fmt: skip
+
+
+def test_a_law_from_a_file_is_its_curve_times_a_scale(chain: Chain) -> None:
+    low, high = 2.0, 40.0
+    law = learned("valve.current", "adds", "x_lvdt", low, high, 0.1, 0.1, 0.1, 0.1)  # splines add up to one
+    placed, effect = curve_effect("law", law)
+    assert [p.name for p in effect.parameters] == ["scale"] and effect.starts == ((1.0,),)
+    assert placed.curve is not None and (placed.curve.low, placed.curve.high) == (low, high)
+    assert placed.curve.whole(np.array([2.0])) == pytest.approx(0.2) and not placed.curve.whole(placed.neutral).any()
+    stage = chain.stage("actuator")
+    assert with_laws(stage, (), (), "a.csv") is stage
+    with_it = with_laws(stage, (), [(placed, effect)], "a.csv")
+    assert [e.name for e in with_it.effects] == ["law"] and with_it.floor is stage.floor
+    two = np.array([with_it.neutral(), with_it.neutral()])
+    two[1, -1] = 3.0
+    still, by = with_it.run(two)[:, 0]
+    theta = np.array([stage.neutral()] * 2)
+    theta[1, stage.index()["valve_null_bias"]] = 0.3  # mA
+    assert np.array([still, by]) == pytest.approx(stage.run(theta)[:, 0], abs=1e-9) and np.ptp(by - still) > 0.1
+    none = curve_effect("law", learned("sensors.lvdt", "adds", "n_dem", 0.0, 1.0, 0.0, 1.0, 2.0, 3.0))
+    without = remade(stage, (), ())
+    assert isinstance(without.made, tuple)
+    driven = without.made.driven  # type: ignore[attr-defined]
+    gone = {k: v for k, v in driven.columns.items() if k != "n_dem"}
+    without.made = without.made._replace(driven=driven._replace(columns=gone))  # type: ignore[attr-defined]
+    with pytest.raises(InputError, match="^a.csv: law: the log has no n_dem$"):
+        with_laws(without, (), [none], "a.csv")
+
+
+def test_a_curve_at_a_shared_place_is_judged_in_the_other_subsystem(chain: Chain) -> None:
+    source = VaneChainCandidates(chain.stage("actuator"), others=[s for s in chain.stages if s.name != "actuator"])
+    assert [s.name for s in source.others] == ["demand", "servo", "engine", "linkage"]
+    law = curve_effect("law", learned("sensors.lvdt", "adds", "x_lvdt", 2.0, 40.0, -2.0, 1.0, -1.0, 2.0))
+    theta = source.stage((), [law]).neutral()
+    assert source.elsewhere([law], theta) == {}  # a scale of 0 moves nothing
+    theta[-1] = 1.0
+    (said,) = source.elsewhere([law], theta).items()
+    assert said[0] == "the linkage subsystem" and said[1] > 1.0 and list(source.left) == ["linkage"]
+    assert source.elsewhere([law], theta) == {said[0]: pytest.approx(said[1])}
+    theta[-1] = 2.0
+    assert source.elsewhere([law], theta)[said[0]] == pytest.approx(said[1] + np.log(2.0), abs=0.2)
+    at_valve = curve_effect("law", learned("valve.current", "adds", "x_lvdt", 2.0, 40.0, -2.0, 1.0, -1.0, 2.0))
+    assert source.elsewhere([at_valve], theta) == {}
+
+
+# ---- what subsystems make of a log
+
+
+def driven_of(stage: Stage) -> Driven:
+    assert stage.made is not None
+    return stage.made.driven  # type: ignore[attr-defined, no-any-return]
+
+
+def test_the_stroke_without_its_noise_and_the_law_on_it_are_as_far_off_as_is_said(chain: Chain) -> None:
+    """A stroke that is known, with a noise that is known."""
+    driven, k = driven_of(chain.stage("actuator")), CALIBRATION.scalars
+    t, c = driven.t, driven.columns
+    known = without_noise(t, c, driven.machine)
+    for sigma in (0.005, 0.02):
+        x = known.stroke + sigma * white(7, len(t))
+        smooth = without_noise(t, c | {"x_lvdt": x}, driven.machine)
+        assert smooth.noise == pytest.approx(sigma, rel=0.06) and smooth.rows == 41
+        assert smooth.off == pytest.approx(x - (smooth.stroke - _smoothed(smooth.off, 41)), abs=1e-9)
+        left = np.std((smooth.stroke - known.stroke)[100:-100])
+        said = [np.std(smooth.left(np.random.default_rng(s))[100:-100] + smooth.distortion[100:-100]) for s in range(4)]
+        assert left < 0.35 * sigma and np.sqrt(np.mean(np.square(said))) == pytest.approx(left, rel=0.25)
+    law, of_mean, of_some = servo_law(t, c | {"x_lvdt": x}, CALIBRATION, smooth, draws=4, samples=2)
+    unknown = sigma * white(9, len(t), 10)
+    unknown[:, -1] = 0.0  # at the row it is logged
+    true = law_of(c["x_dem"], known.stroke, CALIBRATION, logged=x) - k.kp * unknown
+
+    def size(values: Array) -> float:  # in windows, each with a constant of its integral
+        v = values[100:2300].reshape(-1, 100)
+        return float(np.std(v - v.mean(axis=1, keepdims=True)))
+
+    assert [size(d) for d in of_mean.T] == pytest.approx([size(true.mean(axis=1) - law.mean(axis=1))] * 4, rel=0.08)
+    assert [size(d) for d in of_some.T] == pytest.approx([size(samples_of(true - law, 2))] * 4, rel=0.08)
+    assert size(law[:, -1] - true[:, -1]) < 0.3 * k.kp * sigma
+    again = servo_law(t, c | {"x_lvdt": x}, CALIBRATION, smooth, draws=2)
+    assert np.array_equal(again[0], law) and np.array_equal(again[1], of_mean[:, :2])
+
+
+def test_the_demand_of_the_machine_s_own_firmware_is_the_logged_one(chain: Chain) -> None:
+    stage = chain.stage("demand")
+    counts, at = np.isfinite(stage.measured[0]), stage.index()
+    neutral = stage.neutral()
+    as_is = stage.run(neutral[None])[0, 0]
+    assert np.array_equal(as_is[counts], stage.measured[0, counts])
+
+    def with_(name: str, *values: float) -> Array:
+        theta = neutral.copy()
+        theta[at[name]] = values
+        return np.asarray(stage.run(np.array([neutral, theta]))[1, 0])
+
+    inner = slice(500, None)
+    assert with_("schedule_error", 0.7)[inner] == pytest.approx(as_is[inner] + 0.7, abs=0.05)  # but for the rate limit
+    late = with_("can_delay", 0.03)
+    assert late[500:] == pytest.approx(as_is[497:-3])
+    half = with_("can_delay", 0.025)  # between two frames the speeds run straight
+    assert half[inner] == pytest.approx(0.5 * (as_is[498:-2] + as_is[497:-3]), abs=0.04)
+    held = with_("frame_hold", 0.05, 0.4)  # frames of every 50 ms, of which one stands 20 ms behind the first row
+    driven = driven_of(stage)
+    n = np.maximum((np.arange(len(as_is)) - 2) // 5 * 5 + 2, 0)
+    columns = driven.columns | {name: driven.columns[name][n] for name in ("n_dem", "n_r")}
+    same = demand_stage(driven._replace(columns=columns, again=True))
+    assert held[inner] == pytest.approx(same.run(same.neutral()[None])[0, 0, inner])
+    assert not np.array_equal(with_("trend_threshold_error", 5.0), as_is)
+    assert same.lost is None and stage.lost is not None and len(stage.lost) == 8
+    phase = stage.effect("frame_hold").parameters[1]
+    assert (phase.low, phase.high, phase.period, phase.shape) == (0.0, 1.0, 1.0, True)
+    starts = stage.effect("frame_hold").starts
+    assert sorted({h for h, _ in starts}) == pytest.approx(0.01 * np.arange(2, 51))
+    assert [p for h, p in starts if h == pytest.approx(0.04)] == pytest.approx([0.0, 0.25, 0.5, 0.75])
+
+
+def test_a_controller_of_the_user_s_own_is_run_from_below_and_from_above(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its demand (mm): 10 and the table's offset, plus a hundredth of the speed; where it began is forgotten in 1 s."""
+    seen = []
+
+    def run(n_dem: Array, n_r: Array, start: float, angles: Array, before: float, *rest: Any) -> None:
+        *_, flashed, program, out = rest
+        seen.append((start, angles, before, program))
+        forgotten = before * np.exp(-np.arange(len(n_r)) / 20.0)
+        out[:] = 1e-3 * (10.0 + 0.01 * n_r + 0.001 * forgotten) + flashed.table[1, 0] - CALIBRATION.table[1, 0]
+
+    monkeypatch.setattr(demand, "_run", run)
+    n = 1000
+    t = 0.01 * np.arange(n)
+    n_r = 70.0 + 10.0 * np.sin(t)
+    missing = np.zeros(n)
+    missing[700] = 1.0
+    c = {"n_dem": n_r + 1.0, "n_r": n_r, "x_dem": 10.0 + 0.01 * n_r, "missing": missing, "vigv": 10.0 * np.sin(t)}
+    program = SimpleNamespace(start=lambda flashed: "started")
+    cal = CALIBRATION._replace(program=program)
+    machine = build_plant()
+    stage = own_demand_stage(Driven(t, c, machine, cal, ("x_dem",), np.ones(n, dtype=bool), ()))
+    assert [(b, p) for _, _, b, p in seen] == [(demand.APPROACH, "started"), (-demand.APPROACH, "started")]
+    start, angles = seen[0][:2]
+    assert start == pytest.approx(1e-3 * c["x_dem"][0]) and angles.shape == (len(machine.vanes), n)
+    assert angles[0] == pytest.approx(np.deg2rad(c["vigv"])) and np.isnan(angles[1]).all()
+    assert [e.name for e in stage.effects] == ["can_delay", "schedule_error", "trend_threshold_error"]
+    differs = 2e-6 * demand.APPROACH * np.exp(-np.arange(n) / 20.0) > demand.DEMAND_SAME
+    counts = ~lately(differs, 0.5) & ~lately(missing > 0.0, 0.4)
+    assert np.array_equal(np.isfinite(stage.measured[0]), counts) and 0.5 < counts.mean() < 0.99
+    theta = np.array([stage.neutral()] * 3)
+    at = stage.index()
+    theta[1, at["schedule_error"]] = 0.5
+    theta[2, at["can_delay"]] = 0.02
+    as_is, more, late = stage.run(theta)[:, 0]
+    rest = slice(300, None)
+    assert as_is[rest] == pytest.approx(c["x_dem"][rest], abs=1e-4) and more == pytest.approx(as_is + 0.5)
+    assert late[rest] == pytest.approx(as_is[298:-2], abs=1e-4)
+
+
+def test_noise_of_an_input_counts_as_an_error_as_far_as_it_is_seen() -> None:
+    t, grid = 0.01 * np.arange(6000), 0.5
+    values = np.round(40.0 * np.sin(0.02 * t) / grid) * grid
+    for draw in _other_noise(t, values, 3):  # a digit: even over one step, and the same as long as the value is
+        assert np.abs(draw).max() <= 0.5 * grid and np.ptp(draw) > 0.9 * grid
+        assert not np.diff(draw)[np.diff(values) == 0.0].any()
+    one, two = _other_noise(t, np.sin(t) + 0.2 * white(3, 6000), 2)
+    assert one.std() == pytest.approx(0.2, rel=0.05) and abs(np.corrcoef(one, two)[0, 1]) < 0.05
+    makes = np.array([white(k, 6000) for k in (1, 2, 3)])
+    share, beyond = _by_noise(t, 0.5 * white(4, 6000), makes, 1e-3)
+    assert share == pytest.approx(0.25, rel=0.05) and beyond == pytest.approx(0.0, abs=0.1)
+    assert (
+        _by_noise(t, 2.0 * white(4, 6000), makes, 1e-3)[0] == 1.0 and _by_noise(t, makes[0], 0.0 * makes, 1.0)[0] == 0.0
+    )
+    slow = 3.0 * np.sin(0.3 * t)  # what noise behind a filter makes, beside what is seen of it
+    share, beyond = _by_noise(t, 0.5 * white(4, 6000), makes + slow, 1e-3)
+    assert share == pytest.approx(0.25, rel=0.05) and beyond == pytest.approx(0.5 * 3.0 / np.sqrt(2.0), rel=0.05)
+    assert _by_noise(t, 0.5 * white(4, 6000), makes, 2.0)[1] == 0.0  # the floor holds more
+
+
+def test_the_current_between_two_rows_is_what_the_raster_hides_from_the_actuator(chain: Chain) -> None:
+    stage, driven = chain.stage("actuator"), driven_of(chain.stage("actuator"))
+    make = stage.made.make  # type: ignore[attr-defined]
+    other = make(driven._replace(columns=driven.columns | {"ticks": driven.columns["other_ticks"]}))
+    neutral = stage.neutral()
+    between = rms(stage, stage.run(neutral[None])[0] - other.run(neutral[None])[0])
+    again = make(driven._replace(again=True))
+    assert stage.hidden is not None and stage.hidden(neutral) == pytest.approx(between)
+    assert stage.raster_error == pytest.approx(np.hypot(again.raster_error, between)) and between[0] > 0.0
+    assert np.array_equal(again.run(neutral[None]), stage.run(neutral[None]))
+    sticky = neutral.copy()
+    sticky[stage.index()["piston_stiction"]] = stage.effect("piston_stiction").starts[-1]
+    soft = sticky.copy()
+    soft[stage.index()["oil_compressibility"].start] += 20.0
+    hidden = [float(stage.hidden(theta)[0]) for theta in (neutral, sticky, soft)]
+    assert hidden[0] < hidden[1] < hidden[2]
+    one = make(driven._replace(columns={k: v for k, v in driven.columns.items() if k != "other_ticks"}))
+    assert one.hidden is None and one.raster_error == pytest.approx(again.raster_error)
+    assert stage.finer is not None
+    fine, usual = stage.finer(neutral[None]), stage.run(neutral[None])
+    assert 0.0 < np.abs(fine - usual).max() < 0.2 * stage.floor[0] and fine.shape == usual.shape  # type: ignore[index]
+    name, warm = stage.twins["oil_viscosity"]
+    assert name == "time" and warm(neutral[None]) == pytest.approx(usual, abs=0.05)
+    assert stage.quiet is not None and stage.quiet[0] < 1.05 * stage.floor[0]  # type: ignore[index]
+
+
+def test_a_piston_counts_while_it_leans_on_a_stop_and_a_window_after_it_left(chain: Chain) -> None:
+    stage, driven = chain.stage("actuator"), driven_of(chain.stage("actuator"))
+    make = stage.made.make  # type: ignore[attr-defined]
+    full = chain.plant.table.actuator.stroke.value
+    for stop in (0.0, full):
+        x = driven.columns["x_lvdt"].copy()
+        x[1000:1050] = stop
+        counts = np.isfinite(make(driven._replace(columns=driven.columns | {"x_lvdt": x})).measured[0])
+        lost = np.flatnonzero(np.isfinite(stage.measured[0]) & ~counts)
+        assert lost[[0, -1]].tolist() == [1050, 1148] and len(lost) == 99
+    assert stage.counted is not None
+    at = np.r_[600:900, 1200:1500]  # the spool and the lags come from another time
+    kept = stage.counted(at)
+    assert np.flatnonzero(~kept).tolist() == [*range(100), *range(300, 400)]
+
+
+@pytest.mark.parametrize("name", ["actuator", "linkage", "engine"])
+def test_rows_of_an_excerpt_give_what_the_whole_gives_there(chain: Chain, name: str) -> None:
+    stage = chain.stage(name)
+    at = np.r_[500:1100, 1400:2100]
+    theta = np.array([stage.neutral()])
+    whole = stage.run(theta)[0][:, at]
+    driven = driven_of(stage)
+    if stage.excerpt is None:
+        numbers = np.repeat([0.0, 1.0], [600, 700])
+        columns = {k: v[at] for k, v in driven.columns.items()} | {"stretch": numbers}
+        part = stage.made.make(driven.at(at, columns, np.ones(len(at), dtype=bool)))  # type: ignore[attr-defined]
+    else:
+        part = stage.excerpt(at)
+    assert part.t[0] == pytest.approx(5.0) and np.array_equal(driven_of(part).part_of[1], at)  # type: ignore[index]
+    difference = part.run(theta)[0] - whole
+    counts = np.isfinite(part.measured)
+    if stage.window:  # each window's constant is free
+        w = difference.reshape(-1, 100)
+        difference = (w - w.mean(axis=1, keepdims=True)).reshape(1, -1)
+    assert np.abs(difference[counts]).max() < (3.0 if name == "engine" else 0.6) * np.max(stage.floor)  # type: ignore[arg-type]
+    if name == "linkage":
+        assert stage.counted is not None
+        kept = stage.counted(at)
+        last = speed_reach(0.01)  # where the stroke leaps to the next piece
+        assert kept[600 - last - 1] and not kept[600 - last : 600].any() and not kept[-last:].any()
+        assert stage.counted(np.r_[500:1100, 1400:2400])[-1]
+        assert np.array_equal(kept, np.isfinite(part.measured).all(axis=0))
+
+
+def test_the_engine_s_speed_at_the_start_is_what_suits_its_first_second() -> None:
+    machine, n = build_plant(), 800
+    for dt in (0.01, 0.05, 4.0):
+        t = dt * np.arange(n)
+        n_dem = 75.0 + 10.0 * np.sin(0.2 * t / max(1.0, 2.0 * dt))
+        stretch = (np.arange(n) >= 500).astype(int)
+        c = {"n_dem": n_dem, "n_r": n_dem, "stretch": stretch}
+        stage = engine_stage(Driven(t, c, machine, CALIBRATION, ("n_r",), np.ones(n, dtype=bool), ()))
+        theta = stage.neutral()[None]
+        first = stage.run(theta)[0, 0]
+        off = stage.made.make(driven_of(stage)._replace(columns=c | {"n_r": first + 0.5}))  # type: ignore[attr-defined]
+        again = off.run(theta)[0, 0]
+        second = max(1, round(1.0 / dt))
+        for start in (0, 500):
+            head = slice(start, start + second)
+            # the mean of the first second is the logged one: what was off at the start was taken off
+            assert np.mean(again[head]) == pytest.approx(np.mean(first[head]) + 0.5, abs=0.26)
+
+
+def test_a_quantity_of_a_log_is_its_channel_or_what_follows_from_it(chain: Chain) -> None:
+    driven = driven_of(chain.stage("linkage"))
+    t, c = driven.t, driven.columns
+    assert driven.quantity("time") is driven.t and driven.quantity("nothing") is None
+    assert driven.quantity("time_every_7_s") == pytest.approx(t % 7.0)
+    assert driven.quantity("x_lvdt") is c["stroke"] and driven.quantity("n_r") is c["n_r"]
+    assert driven.quantity("stops_of_x_lvdt") is c["stroke"]
+    late = driven.quantity("n_r_lagged_by_500_ms")
+    assert late is not None and late[0] == pytest.approx(c["n_r"][0])
+    wanted = c["n_r"][0]
+    share = 1.0 - np.exp(-0.01 / 0.5)
+    for k in range(1, 200):
+        wanted += share * (c["n_r"][k] - wanted)
+    assert late[199] == pytest.approx(wanted, abs=0.03)
+    v = driven.quantity("vgv1")
+    assert v is not None and 0.0 < np.std(v - c["vgv1"]) < 0.1 and np.std(np.diff(v)) < np.std(np.diff(c["vgv1"]))
+    speed = driven.quantity("speed_of_x_lvdt")
+    assert speed is not None and np.corrcoef(speed, np.gradient(c["stroke"], t))[0, 1] > 0.98
+    assert driven._replace(columns={}, turns=dict).quantity("speed_of_x_lvdt") is None
+    at = np.r_[100:300, 700:900]
+    part = driven.at(at, {k: x[at] for k, x in c.items()}, driven.run[at])
+    for name in ("vgv1", "speed_of_x_lvdt", "n_r_lagged_by_500_ms", "x_lvdt"):
+        whole = driven.quantity(name)
+        assert whole is not None and np.array_equal(part.quantity(name), whole[at]), name  # type: ignore[arg-type]
+    assert part.quantity("nothing") is None and driven._late("nothing", 1.0) is None
+    assert driven.signals().size == 0 and not driven.curved  # no curve: no signals
+    law = curve_effect("law", learned("linkage.ring", "adds", "n_r", 50.0, 90.0, 0.1, 0.1, 0.1, 0.1))
+    lagged_law = curve_effect(
+        "late", learned("linkage.ring", "adds", "x_lvdt_lagged_by_300_ms", 2.0, 40.0, 0.0, 1.0, 2.0, 3.0)
+    )
+    signals = driven._replace(curves=(law, lagged_law)).signals()
+    assert driven._replace(curves=(law,)).curved and len(signals) == KNOWN + 2
+    assert signals[QUANTITIES["n_r"].of] == pytest.approx(c["n_r"]) and np.isnan(signals[QUANTITIES["time"].of]).all()
+    assert signals[QUANTITIES["x_lvdt"].of] == pytest.approx(1e-3 * c["stroke"]) and np.isnan(signals[-2]).all()
+    assert signals[-1] == pytest.approx(1e-3 * driven.quantity("x_lvdt_lagged_by_300_ms"))  # type: ignore[operator]
+
+
+# ---- a log that lacks something
+
+
+def chain_of(log: Log, **kw: Any) -> Chain:
+    """Its stages with every channel where the file has it."""
+    grid = grid_of(log)
+    return build_chain(log, grid=grid, pieces=[(0, grid.rows)], **kw)
+
+
+def with_(log: Log, **values: Any) -> Log:
+    """The same with other channels: values at its times, or a channel; None: without."""
+    t = log["n_dem"].t
+    made = {k: v if isinstance(v, Channel) else Channel(t, v) for k, v in values.items() if v is not None}
+    return Log("a.csv", {k: v for k, v in (log.channels | made).items() if values.get(k, v) is not None})
+
+
+NAMES = ["demand", "servo", "engine", "actuator", "linkage"]
+
+
+def told(c: Chain) -> tuple[list[str], dict[str, str], list[str]]:
+    return [s.name for s in c.stages], c.not_observed, list(c.notes)
+
+
+def test_what_a_log_lacks_is_told_and_the_rest_is_judged(machine_log: Log, chain: Chain) -> None:
+    log, n = machine_log, 2400
+    none = "not logged; {} assumed, and effects that need it to change cannot be seen"
+    assert told(chain_of(with_(log, p_s=None, t_oil=None))) == (
+        NAMES, {}, [f"p_s: {none.format('21 MPa')}", f"t_oil: {none.format('40 degC')}"]
+    )  # fmt: skip
+    assert told(chain_of(with_(log, vgv5=np.sin(np.arange(n))))) == (
+        NAMES, {}, ["vgv5: this machine has no such vane row (geometry); not judged"]
+    )  # fmt: skip
+    with pytest.raises(LogError, match="^a.csv: 400 samples of 0.01 s; at least 500 are needed to search for missing"):
+        chain_of(Log("a.csv", {k: Channel(c.t[:400], c.values[:400]) for k, c in log.channels.items()}))
+    still = chain_of(with_(log, n_dem=np.full(n, 70.0), n_r=np.full(n, 70.0), x_dem=np.full(n, 5.0)))
+    assert told(still) == (
+        NAMES[1:2] + NAMES[3:], {"demand": "n_dem, n_r, x_dem never change", "engine": "n_dem, n_r never change"}, []
+    )  # fmt: skip
+    alone = build_chain(Log("a.csv", {"n_dem": log["n_dem"]}))
+    assert [s.name for s in alone.stages] == [] and alone.not_observed == {
+        "demand": "no n_r", "servo": "no x_dem, x_lvdt", "engine": "no n_r", "actuator": "no i_cmd",
+        "linkage": "no x_lvdt",
+    }  # fmt: skip
+    n_dem, n_r = log["n_dem"], log["n_r"]
+    apart = build_chain(
+        with_(log, n_dem=Channel(n_dem.t[:1000], n_dem.values[:1000]), n_r=Channel(n_r.t[1200:], n_r.values[1200:]))
+    )
+    assert apart.not_observed == {
+        "demand": "n_dem, n_r, x_dem have no time in common", "engine": "n_dem, n_r have no time in common"
+    }  # fmt: skip
+    (note,) = apart.notes
+    assert note == "n_r begins at 12 s: actuator, linkage not judged before it"
+    assert isinstance(note, Note) and (note.kind, note.of, note.number) == ("cut", "n_r", 1200)
+
+
+def test_a_controller_that_mostly_stood_aside_leaves_the_machine(machine_log: Log, chain: Chain) -> None:
+    t = 0.01 * np.arange(2400)
+    mostly = chain_of(with_(machine_log, state=np.where(t < 6.0, 1.0, 2.0)))
+    assert told(mostly) == (NAMES, {}, [])
+    aside = chain_of(with_(machine_log, state=np.where(t < 15.0, 1.0, 2.0)))
+    assert told(aside) == (
+        NAMES, {}, ["state: mode RUN in 43% of the log; engine, actuator and linkage are judged in all modes"]
+    )  # fmt: skip
+    for c, run, machine in ((mostly, 6.0, 6.0), (aside, 15.0, 0.0)):
+        first = {s.name: float(s.t[np.isfinite(s.measured).any(axis=0)][0]) for s in c.stages}
+        # 3 s after the start, or after a gap, all has settled; so has the firmware that long after it is in mode RUN
+        assert first["engine"] == max(machine, 3.0) and first["actuator"] == machine + 3.0
+        assert first["demand"] >= run + 3.0 == first["servo"] and first["linkage"] >= first["engine"]
+    few = chain_of(with_(machine_log, state=np.where((t > 19.0) & (t < 23.2), 2.0, 1.0)))
+    assert few.not_observed == dict.fromkeys(["demand", "servo"], "fewer than 300 samples in mode RUN without gaps")
+    never = chain_of(with_(machine_log, state=np.ones(2400)))
+    assert set(never.not_observed) == {"demand", "servo"} and len(never.notes) == 1
+
+
+def test_a_log_that_is_slow_says_what_its_raster_costs(machine_log: Log, chain: Chain) -> None:
+    slow = chain_of(Log("a.csv", {k: Channel(c.t[::2], c.values[::2]) for k, c in machine_log.channels.items()}))
+    why = "sample time of 0.02 s; the controller works every 0.01 s"
+    assert slow.not_observed == {"demand": why, "servo": why} and [s.name for s in slow.stages] == NAMES[2:]
+    assert list(slow.notes) == [
+        "i_cmd: the current at single ticks, not the mean since the row before, which is worked out from it"
+    ]
+    for stage in slow.stages:
+        error = stage.run(stage.neutral()[None])[0] - stage.measured
+        assert stage.raster_error is not None and np.all(stage.raster_error > 0.0)
+        assert np.all(rms(stage, error) < 1.6 * np.asarray(stage.floor)), stage.name
+        assert np.all(np.asarray(stage.floor) >= stage.raster_error)
+    engine, fast = slow.stage("engine"), chain.stage("engine")
+    assert engine.run(engine.neutral()[None])[0] == pytest.approx(fast.run(fast.neutral()[None])[0][:, ::2], abs=0.05)
+
+
+def test_samples_that_an_exporter_joined_cost_what_lies_between_them(machine_log: Log, chain: Chain) -> None:
+    joined = chain_of(with_(machine_log, n_dem=replace(machine_log["n_dem"], apart=0.05)))
+    for name in ("demand", "engine"):
+        stage, whole = joined.stage(name), chain.stage(name)
+        assert stage.raster_error is not None
+        driven = driven_of(stage)
+        half = driven.columns["n_dem"][np.minimum(np.arange(2400) + 2, 2399)]
+        other = stage.made.make(driven._replace(columns=driven.columns | {"n_dem": half}, again=True))  # type: ignore[attr-defined]
+        cost = rms(stage, stage.run(stage.neutral()[None])[0] - other.run(other.neutral()[None])[0])
+        own = 0.0 if whole.raster_error is None else whole.raster_error
+        assert np.all(stage.raster_error >= 0.99 * np.hypot(cost, own))
+        assert stage.raster_error[0] < 1.5 * np.hypot(cost, own)[0] and stage.floor[0] > whole.floor[0]  # type: ignore[index]
+    for name in ("servo", "actuator"):
+        assert joined.stage(name).floor == pytest.approx(chain.stage(name).floor)
+
+
+def test_a_stroke_whose_low_bits_are_lost_is_no_ground_for_a_name(machine_log: Log) -> None:
+    coarse = chain_of(with_(machine_log, x_lvdt=np.round(machine_log["x_lvdt"].values / 0.0733) * 0.0733))
+    assert coarse.steps == {"x_lvdt": pytest.approx(0.0733)}
+    assert [s.name for s in coarse.stages if s.coarse] == ["servo", "actuator", "linkage"]
+    assert {str(s.coarse["x_lvdt"]).split(",")[0] for s in coarse.stages if s.coarse} == {
+        "x_lvdt comes in steps of 0.0733 mm"
+    }
+    source = VaneChainCandidates(coarse.stage("engine"), others=coarse.stages)
+    assert [s.name for s in source.others] == ["demand", "engine"]
+
+
+def test_what_begins_late_or_ends_early_is_told_with_its_channel(machine_log: Log) -> None:
+    p_s, vigv = machine_log["p_s"], machine_log["vigv"]
+    c = build_chain(
+        with_(machine_log, p_s=Channel(p_s.t[500:], p_s.values[500:]), vigv=Channel(vigv.t[:1500], vigv.values[:1500]))
+    )
+    assert told(c) == (
+        NAMES, {},
+        ["vigv: measured from 0 to 14.99 s, judged there alone", "p_s begins at 5 s: actuator not judged before it"],
+    )  # fmt: skip
+    linkage = c.stage("linkage")
+    assert [float(linkage.t[np.isfinite(m)][-1]) for m in linkage.measured] == pytest.approx([14.99, 23.99, 23.99])
+    assert c.stage("actuator").t[0] == pytest.approx(5.0) and len(c.t) == 2400
+    short = Channel(p_s.t[:1900], p_s.values[:1900])
+    assert list(build_chain(with_(machine_log, p_s=short)).notes) == [
+        "p_s ends at 18.99 s: actuator not judged after it"
+    ]
+
+
+def test_a_law_that_the_machine_has_needs_its_channel(machine_log: Log, chain: Chain) -> None:
+    law = learned("valve.current", "adds", "vgv2", -90.0, 90.0, 0.2, 0.2, 0.2, 0.2)
+    machine = Model(curves={"law": law}, effects={"law": {}}).plant(build_plant())
+    with pytest.raises(LogError, match="^a.csv: has no vgv2, of which a learned law of the model is a function$"):
+        chain_of(with_(machine_log, vgv2=None), plant=machine)
+    stage, without = chain_of(machine_log, plant=machine).stage("actuator"), chain.stage("actuator")
+    theta = without.neutral()
+    theta[without.index()["valve_null_bias"]] = 0.2  # mA: as the law adds to the current
+    by_law, by_bias = stage.run(stage.neutral()[None])[0, 0], without.run(theta[None])[0, 0]
+    assert by_law == pytest.approx(by_bias, abs=1e-3)
+    assert np.abs(by_law - without.run(without.neutral()[None])[0, 0]).max() > 0.01
