@@ -5,6 +5,9 @@ which parameters and starts suit them, and what a curve does at each place.
 from __future__ import annotations
 
 import re
+import sys
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,17 +16,31 @@ import scipy
 
 from hil.logs.notes import Note
 from plant.model import Learned
+from vaneloop.base.errors import InputError
 from vaneloop.identification import Parameter, Record, StageError, System, unknown
+from vaneloop.identification.candidates.library import Size
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import StageDiagnosis
 from vaneloop.identification.selection.diagnosis import diagnose_stage
 from vaneloop.identification.settings import LEVEL_SPREAD
 from vaneloop.identification.subsystem import Array
-from vaneloop.identification.user_models.bound_system import BoundSystem
-from vaneloop.identification.user_models.by_log import ByLog, Logs, as_given, bind, parameter_warnings
-from vaneloop.identification.user_models.data import Data, noise_of_channel, noise_of_neighbours, without_order
-from vaneloop.identification.user_models.experiment import SHAPES, Limits, _Bench, _Parameters
+from vaneloop.identification.user_models.bound_system import BoundSystem, steps_seen
+from vaneloop.identification.user_models.by_log import ByLog, Logs, _loaded, as_given, bind, parameter_warnings
+from vaneloop.identification.user_models.codegen import try_law
+from vaneloop.identification.user_models.data import Data, noise_of_channel, noise_of_neighbours, spikes, without_order
+from vaneloop.identification.user_models.exogenous_regressors import column_of, every, sides_of
+from vaneloop.identification.user_models.experiment import (
+    SHAPES,
+    Limits,
+    _Bench,
+    _Parameters,
+    _Rivals,
+    driven,
+    recommend,
+)
 from vaneloop.identification.user_models.hysteresis_regressors import forgotten, swings
+from vaneloop.identification.user_models.injection_points import _size
+from vaneloop.identification.user_models.load import load_system
 from vaneloop.identification.user_models.motion import differentiated_to, highest_frequency, low_pass, motion, smoothed
 from vaneloop.identification.user_models.user_code import cannot
 from vaneloop.identification.user_models.user_laws import Law
@@ -1062,3 +1079,553 @@ def test_forces_are_compared_up_to_a_frequency_and_not_at_the_ends() -> None:
     own = Data(mover(cutoff=3.0), [record(t, x=x, f=2.0 * a)])
     assert own.cutoff == 3.0 and own.notes == []
     assert d.noise() == pytest.approx([0.01 * np.sqrt(2.0 * d.cutoff * 0.005)], rel=0.4)
+
+
+# ---- what a user writes ----------------------------------------------------------------------------------------------
+
+MOVING: dict[str, Any] = {
+    "kind": "simulate", "model": lambda x, u, p: (x.speed, u.u), "outputs": {"angle": "rad"},
+    "states": {"angle": "rad", "speed": "rad/s"}, "rates": {"speed": "angle"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"kind": "dynamic"}, "kind (='dynamic') must be one of static, force, simulate, closed_loop"),
+        ({"model": 3}, "model (=3) must be a function"),
+        ({"outputs": {}}, "outputs is empty; at least one measured channel must be explained"),
+        ({"inputs": ["u"]}, "inputs (=['u']) must be a dict of name -> unit"),
+        (
+            {"outputs": {"y 1": "V"}},
+            "outputs: 'y 1' must be a Python name (letters, digits, _); --map renames a log's channel",
+        ),
+        (
+            {"inputs": {"_u": "A"}},
+            "inputs: '_u' must be a Python name (letters, digits, _); --map renames a log's channel",
+        ),
+        ({"parameters": [3]}, "parameters: 3 is not a Parameter; write Parameter(...) or unknown(...)"),
+        ({"parameters": [Parameter("a", True, "-")]}, "parameter 'a': value (=True) must be a number"),
+        ({"parameters": [Parameter("if", 1.0, "-")]}, "parameter 'if' must be a Python name"),
+        ({"parameters": [Parameter("a", 3.0, "-", 0.0, 2.0)]}, "parameter a (=3 -) must be in [0, 2]"),
+        ({"parameters": [unknown("a", 1.0, "-")] * 2}, "two parameters share a name among a, a"),
+        (
+            {"kind": "force"},
+            "kind 'force' needs position=, the channel of the displacement, or velocity=, that of its rate",
+        ),
+        ({"kind": "simulate"}, "kind 'simulate' needs states=, name -> unit"),
+        (
+            {"kind": "closed_loop", "states": {"y": "V"}, "control": gain},
+            "kind 'closed_loop' needs control=, a function (r, y, p), and commands=, name -> unit of what it returns",
+        ),
+        (MOVING | {"rates": {"speed": "way"}}, "rates: 'way' is not a state; states are angle, speed"),
+        (MOVING | {"masses": {"angle": "m"}}, "masses: 'angle' is not a velocity of rates"),
+        (MOVING | {"masses": {"speed": "m"}}, "masses: 'm' is not a parameter; parameters are a"),
+        (MOVING | {"start": {"way": 1.0}}, "start: 'way' is not a state; states are angle, speed"),
+        (
+            MOVING | {"start": {"angle": "fitted"}, "window": 1.0},
+            "start: 'angle' 'fitted' does not go with window=, which starts from measured states",
+        ),
+        (MOVING | {"start": {"angle": "there"}}, "start: 'angle' (='there') must be a number or 'fitted'"),
+        (MOVING | {"start": {"angle": np.inf}}, "start: 'angle' (=inf) must be a number or 'fitted'"),
+        (MOVING | {"start": {"angle": True}}, "start: 'angle' (=True) must be a number or 'fitted'"),
+        (
+            MOVING | {"outputs": {"way": "m"}},
+            "output 'way' is not a state; name it like one of angle, speed, or give output=, a function (x, u, p)",
+        ),
+        ({"between": "curve"}, "between (='curve') must be one of hold, line, smooth"),
+        ({"start_force": "some"}, "start_force (='some') must be 'unloaded' or 'measured'"),
+        ({"window": 0.0}, "window (=0.0) must be above 0"),
+        ({"cutoff": np.inf}, "cutoff (=inf) must be above 0"),
+        ({"places": ["v"]}, "places: 'v' is not known; allowed: force, input, output, state, u, y"),
+        ({"laws": "bias"}, "laws (='bias') must be a list of Law(...)"),
+        ({"laws": [3]}, "laws: 3 is not a Law; write Law(name, on, function, parameters, starts)"),
+    ],
+)
+def test_a_system_that_cannot_be_gets_one_line(change: dict[str, Any], said: str) -> None:
+    good: dict[str, Any] = {
+        "kind": "static", "model": gain, "outputs": {"y": "V"}, "inputs": {"u": "A"},
+        "parameters": [unknown("a", 1.0, "V/A")],
+    }  # fmt: skip
+    assert not System("map", **good).holds
+    with pytest.raises(StageError) as e:
+        System("map", **good | change)
+    assert str(e.value) == f"system 'map': {said}"
+
+
+def test_a_system_says_what_it_is_of() -> None:
+    shaft = System("shaft", **MOVING, inputs={"u": "A"}, places=["speed", "output"])
+    assert shaft.holds and not System("shaft", **MOVING, between="line").holds
+    assert shaft.channels() == ("u", "angle") and shaft.optional() == set()
+    assert shaft.reading_of("angle") == "angle_sensor" and mapping().reading_of("y") == "y"
+    assert shaft.allows("state", "speed") and shaft.allows("output", "angle") and not shaft.allows("input", "u")
+    assert mapping().allows("input", "u") and mover().channels() == ("x", "f")
+    p = unknown("a", 2.0, "m", -1.0, 9.0)
+    assert (p.name, p.value, p.unit, p.low, p.high, p.tolerance) == ("a", 2.0, "m", -1.0, 9.0, np.inf)
+    law = Law("shifted", "signal", shifted, [Parameter("by", 0.0, "V", -5.0, 5.0)], [-5.0], places=["w"])
+    with pytest.raises(StageError) as e:
+        mapping(laws=[law])
+    assert str(e.value) == (
+        "system 'map': law 'shifted': places: 'w' is not known; allowed: force, input, output, state, u, y"
+    )
+    twice = Law("shifted", "signal", shifted, [Parameter("by", 0.0, "V", -5.0, 5.0)], [-5.0])
+    with pytest.raises(StageError, match="^system 'map': laws: two are named 'shifted'$"):
+        mapping(laws=[twice, twice])
+
+
+FILE = """
+from vaneloop.identification import System, unknown
+{0}
+system = System("lag", "static", lambda u, p: p.a * u.u, {{"y": "V"}}, {{"u": "A"}}, [unknown("a", 1.0, "-")])
+{1}
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (FILE.format("", "system.outputs = [3"), "line 5: '[' was never closed"),
+        (FILE.format("1 / 0", ""), "failed at line 3 of model.py: ZeroDivisionError: division by zero"),
+        (FILE.format('System("a", "b", 3, {})', ""), "system 'a': kind (='b') must be one of static, force, simulate, "
+         "closed_loop"),
+        ("", "0 objects of vaneloop.System; exactly one is needed, as in system = System(...)"),
+        (FILE.format("", 'other = System("b", "static", abs, {"y": "V"})'), "2 objects of vaneloop.System; exactly one "
+         "is needed, as in system = System(...)"),
+    ],
+)  # fmt: skip
+def test_a_file_without_one_system_gets_one_line(tmp_path: Path, text: str, said: str) -> None:
+    at = tmp_path / "model.py"
+    at.write_text(text)
+    before = list(sys.path)
+    with pytest.raises(StageError) as e:
+        load_system(at)
+    assert str(e.value) == f"{at}: {said}" and sys.path == before and "discrepancy" not in sys.modules
+    at.write_text(FILE.format("import beside", "again = system"))
+    (tmp_path / "beside.py").write_text("")
+    assert load_system(at).name == "lag"  # of two names, one system
+    with pytest.raises(StageError, match="no such file; --system wants a Python file with a System in it"):
+        load_system(tmp_path / "none.py")
+    (tmp_path / "model.txt").write_text("")
+    with pytest.raises(StageError, match=r"model.txt: is not a Python file \(\*\.py\)$"):
+        load_system(tmp_path / "model.txt")
+
+
+@pytest.mark.parametrize(
+    ("function", "said"),
+    [
+        (lambda u, t, p: u / 0.0, "failed{} with by 0 at u = -1: ZeroDivisionError: float division by zero"),
+        (lambda u, t, p: [u], "returned [-1.0] with by 0 at u = -1; a finite number is needed"),
+        (lambda u, t, p: float("nan"), "returned nan with by 0 at u = -1; a finite number is needed"),
+        (lambda u, t, p: None, "returned None with by 0 at u = -1; a finite number is needed"),
+        (
+            lambda u, t, p: u + 0.5,
+            "must change nothing at its neutral sizes (by 0), but gives -0.5 at u = -1; -1 is needed",
+        ),
+        (lambda u, t, p: u + 1.0 / (p.by - 2.0) + 0.5, "failed{} with by 2 at u = -1: ZeroDivisionError: float "
+         "division by zero"),
+    ],
+)  # fmt: skip
+def test_an_own_law_is_tried_over_the_range_of_the_data(function: Any, said: str) -> None:
+    law = Law("own", "signal", function, [Parameter("by", 0.0, "V", -5.0, 5.0)], [2.0])
+    size = Size(-1.0, 3.0, 1.0, 2.0, 0.1, 6.0, unit="V")
+    with pytest.raises(StageError) as e:
+        try_law(law, "u", size)
+    where = re.sub(r" at line \d+ of \w+\.py", "", str(e.value))
+    assert where == f"law 'own' on u: {said.format('')}"
+
+
+def test_an_own_law_of_a_force_and_one_that_remembers_are_tried_too() -> None:
+    seen: list[tuple[float, ...]] = []
+
+    def pull(v: Any, x: Any, t: Any, p: Any) -> Any:
+        seen.append((v, x, t))
+        return p.by * v
+
+    size = Size(-1.0, 3.0, 1.0, 2.0, 0.1, 6.0, unit="m", force=7.0, speed=2.0, travel=0.5)
+    try_law(Law("own", "force", pull, [Parameter("by", 0.0, "N", -5.0, 5.0)], [2.0]), "force", size)
+    v, x, t = np.array(seen).T.reshape(3, 2, 9)
+    assert np.array_equal(v[0], v[1]) and v[0].max() == 3.0 == -v[0].min() and t[0] == pytest.approx(0.1 * np.arange(9))
+    assert (x[0].min(), x[0].max()) == (-0.5, 0.5) and np.diff(x[0]) == pytest.approx(np.full(8, 0.125))
+    steps: list[float] = []
+
+    def summed(u: Any, t: Any, dt: Any, p: Any, m: Any) -> Any:
+        steps.append(dt)
+        m[0] += dt
+        return u + p.by * m[0]
+
+    try_law(Law("own", "signal", summed, [Parameter("by", 0.0, "V", -5.0, 5.0)], [2.0], memory=1), "u", size)
+    assert steps == [0.0, *[0.1] * 8] * 2
+
+
+# ---- spikes, steps and columns ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 4])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_spike_is_as_long_as_it_may_be(length: int, sign: float) -> None:
+    y = np.sin(0.02 * np.arange(2000)) + 0.01 * white(8, 2000)
+    at = [200, 900, 1500]
+    for k in at:
+        y[k : k + length] += sign * 5.0
+    wanted = [j for k in at for j in range(k, k + length)] if length <= 3 else []
+    assert np.flatnonzero(spikes(y)).tolist() == wanted
+    gaps = put(y, [100, 600])
+    assert np.flatnonzero(spikes(gaps)).tolist() == wanted
+
+
+def test_what_answers_an_input_or_comes_often_is_no_spike() -> None:
+    y = np.sin(0.02 * np.arange(2000)) + 0.01 * white(8, 2000)
+    at = np.array([200, 600, 900, 1500])
+    y[at] += 5.0
+    u = np.zeros(2000)
+    u[at] = 1.0
+    drive = 0.01 * white(9, 2000)
+    assert np.flatnonzero(spikes(y, [drive])).tolist() == at.tolist()
+    assert not spikes(y, [drive, u + drive]).any()  # each with a jump of the input beside it
+    u[:] = 0.0
+    u[200] = u[1000] = u[1100] = u[1200] = u[1300] = u[1400] = u[1450] = 1.0
+    assert np.flatnonzero(spikes(y, [u + drive])).tolist() == at.tolist()  # one of its jumps in seven: chance
+    assert not spikes(y[:49]).any()
+    often = np.sin(0.02 * np.arange(2000)) + 0.01 * white(8, 2000)
+    often[np.arange(20, 1900, 150)] += 5.0
+    assert spikes(often).sum() == 0  # 13 in 2000 are more than a half in a hundred
+    few = put(often, np.arange(20, 1900, 150)[9:], 0.0)
+    del few
+    swings_about = np.where(np.arange(2000) % 100 < 50, 1.0, -1.0) + 0.01 * white(8, 2000)
+    assert not spikes(swings_about).any()
+    log = record(np.arange(2000.0), u=drive, y=y)
+    d = Data(mapping(), [log])
+    assert np.flatnonzero(np.isnan(d.y[0][0])).tolist() == at.tolist()
+    assert d.notes == [f"log: y: 4 samples left out that jump away and back, first {y[200]:.4g} at 200 s"]
+    one = Data(mapping(), [record(np.arange(2000.0), u=drive, y=put(y, at[1:], 0.0))])
+    assert any(n.startswith("log: y: ") for n in one.notes)
+
+
+@pytest.mark.parametrize("step", [0.05, 0.3])
+def test_the_step_of_a_sensor_that_rounds_is_among_those_to_begin_from(step: float) -> None:
+    m = 4.0 * np.sin(0.013 * np.arange(800)) + 0.3 * np.sin(0.31 * np.arange(800))
+    y = np.round(m / step) * step + 0.002 * white(1, 800)
+    found = steps_seen(put(y, 7), m, 0.002)
+    assert found == sorted(found) and min(abs(s - step) for s in found) < 2e-3 * step
+    assert steps_seen(y[:1], m[:1], 0.1) == [] == steps_seen(y, np.ones(800), 0.1) == steps_seen(y, m, 10.0)
+    bound = BoundSystem(mapping(places=["y"]), [record(np.arange(800.0), u=m, y=y)])
+    starts = [s for (s,) in bound.stage.effect("y.quantisation").starts]
+    assert starts == sorted(starts) and min(abs(s - step) for s in starts) < 5e-3 * step
+
+
+def test_columns_of_a_log_are_channels_and_what_follows_from_them() -> None:
+    t = 3.0037 + 0.01 * np.arange(500)
+    x = np.sin(2.0 * t)
+    log = record(t - t[0], x=x, w=put(np.arange(500.0), slice(100, 200)), none=np.full(500, np.nan))
+    assert column_of(log, t, "time") is t
+    assert column_of(log, t, "time_every_700_ms") == pytest.approx(t % 0.7)
+    assert column_of(log, t, "x_every_0p3") == pytest.approx(x % 0.3)
+    assert column_of(log, t, "w") == pytest.approx(np.arange(500.0))  # a gap is bridged
+    assert not column_of(log, t, "none").any() and column_of(log, t, "stops_of_x") == pytest.approx(x)
+    tau, y = 0.25, x[0]
+    for k in range(1, 500):  # exact between samples that straight lines join
+        z = 0.01 / tau
+        y = x[k] - (x[k] - x[k - 1]) / z + (y - x[k - 1] + (x[k] - x[k - 1]) / z) * np.exp(-z)
+    late = column_of(log, t, "x_lagged_by_250_ms")
+    assert late[0] == x[0] and late[-1] == pytest.approx(y)
+    way, distance, since = (column_of(log, t, f"{p}_of_x") for p in ("direction", "distance_since_reversal",
+                                                                     "time_since_reversal"))  # fmt: skip
+    moves = np.abs(np.cos(2.0 * t)) > 0.3
+    assert np.all((way == np.sign(np.cos(2.0 * t)))[moves & (t > 3.5)])
+    turned = (np.floor((2.0 * t - np.pi / 2) / np.pi) * np.pi + np.pi / 2) / 2.0  # s, of the last turn
+    late_enough = moves & (turned > 3.0)
+    assert since[late_enough] == pytest.approx((t - turned)[late_enough], abs=0.06)
+    assert distance[late_enough] == pytest.approx(np.abs(x - np.sin(2.0 * turned))[late_enough], abs=0.02)
+    named = {"way_of": x, "direction_of_x": x + 1.0, "time": x}
+    own = record(t - t[0], **named)
+    assert column_of(own, t, "direction_of_x") == pytest.approx(x + 1.0)  # a channel of that name is that channel
+    assert every(0.7, 3.0) == "time_every_700_ms" and every(0.123456789, 100.0) == "time_every_123460_us"
+    assert sides_of("a_minus_b_minus_c", ["a", "b_minus_c"]) == ("a", "b_minus_c")
+    assert sides_of("a_minus_b", ["a", "b", "a_minus_b"]) is None and sides_of("a_minus_b", ["a"]) is None
+
+
+def test_how_large_the_data_of_a_place_are() -> None:
+    t = 0.01 * np.arange(5000)
+    x = 3.0 + 2.0 * np.sin(4.0 * t)
+    s = _size([record(t)], [put(x, slice(10, 20))], "mm", travel=0.5)
+    assert (s.low, s.high) == pytest.approx((1.0, 5.0), abs=0.01)
+    assert s.rate == pytest.approx(8.0 / np.sqrt(2.0), rel=0.01) and s.fastest == pytest.approx(8.0, rel=0.01)
+    assert s.step == pytest.approx(0.01) and s.span == pytest.approx(49.99) and (s.unit, s.travel) == ("mm", 0.5)
+    held = np.repeat(white(1, 500), 10)
+    assert _size([record(t)], [held], "mm").held == pytest.approx(0.1)
+    flat = _size([record(t), record(2.0 * t)], [np.full(5000, 4.0)] * 2, "mm")
+    assert (flat.low, flat.high, flat.span) == pytest.approx((2.0, 6.0, 99.98)) and flat.held == 0.0
+    assert flat.rate == flat.fastest == pytest.approx(4.0 / 99.98)
+    none = _size([record(t)], [np.full(5000, np.nan)], "mm")
+    assert (none.low, none.high) == (-0.5, 0.5)
+    one = _size([record(t)], [np.where(t < 1e-3, 1.0, 0.0)], "mm")  # one sample in 5000
+    assert (one.low, one.high) == (0.0, 1.0)
+
+
+# ---- loops, machines and windows -------------------------------------------------------------------------------------
+
+
+def plant_of_loop(x: Any, u: Any, p: Any) -> Any:
+    return u.i - NUMBERS["one"] * p.c * x.y
+
+
+def proportional(r: Any, y: Any, p: Any) -> Any:
+    return p.k * (r.w - y.y)
+
+
+def test_laws_in_a_loop_act_before_the_controller_and_behind_it() -> None:
+    """A proportional controller: a bias of its sensor moves the loop as a change of its demand does."""
+    system = System(
+        "loop", "closed_loop", plant_of_loop, {"y": "V"}, {"w": "V"},
+        [Parameter("c", 0.5, "1/s"), Parameter("k", 2.0, "1/s")], states={"y": "V"}, start={"y": 0.3},
+        control=proportional, commands={"i": "V/s"},
+    )  # fmt: skip
+    w = np.repeat(white(3, 5), 10)
+
+    def looped(demand: Array, bias: float = 0.0, kick: float = 0.0, begin: float = 0.3) -> Array:
+        """The exact loop, whose command holds from one sample to the next."""
+        y = [begin]
+        for k in range(49):
+            i = 2.0 * (demand[k] - y[-1] - bias) + kick
+            y.append(i / 0.5 + (y[-1] - i / 0.5) * np.exp(-0.5 * 0.08))
+        return np.array(y) + bias
+
+    bound = BoundSystem(system, [record(SHORT, w=w, y=looped(w))])
+    neutral, index = bound.stage.neutral(), bound.stage.index()
+
+    def with_law(law: str, *numbers: float) -> Array:
+        theta = neutral.copy()
+        theta[index[law]] = numbers
+        return np.asarray(bound.run(theta[None])[0, 0])
+
+    assert with_law("i.bias", 0.0) == pytest.approx(looped(w), abs=2e-3)
+    assert with_law("i.bias", 0.4) == pytest.approx(looped(w, kick=0.4), abs=2e-3)
+    assert with_law("y_sensor.bias", 0.25) == pytest.approx(looped(w, 0.25), abs=2e-3)
+    assert not any(name.startswith("w.") for name in index) and {"i.gain", "y.leak", "y_sensor.gain"} <= set(index)
+
+
+def swinging(x: Any, u: Any, p: Any) -> Any:
+    return x.speed, NUMBERS["one"] * (u.f - p.k * x.way) / p.m
+
+
+def machine(**more: Any) -> System:
+    """A mass on a spring that a force drives; its displacement is measured."""
+    given: dict[str, Any] = {
+        "outputs": {"way": "m"}, "inputs": {"f": "N"}, "states": {"way": "m", "speed": "m/s"},
+        "rates": {"speed": "way"}, "masses": {"speed": "m"},
+        "parameters": [Parameter("m", 2.0, "kg"), Parameter("k", 8.0, "N/m")],
+    }  # fmt: skip
+    return System("machine", "simulate", swinging, **given | more)
+
+
+def test_a_law_of_force_on_a_machine_is_that_force_over_its_mass() -> None:
+    f = np.repeat(white(4, 5), 10)
+    bound = BoundSystem(machine(start={"way": 0.2, "speed": -0.1}), [record(SHORT, f=f, way=0.1 * white(5, 50))])
+    neutral, index = bound.stage.neutral(), bound.stage.index()
+
+    def reference(viscous: float = 0.0, offset: float = 0.0, spring: float = 0.0) -> Array:
+        x = [np.array([0.2, -0.1])]
+        for k in range(49):
+            got = scipy.integrate.solve_ivp(
+                lambda t, x, k=k: [x[1], (f[k] - (8.0 + spring) * x[0] - viscous * x[1] - offset) / 2.0],
+                SHORT[k : k + 2], x[-1], rtol=1e-8, atol=1e-10,
+            )  # fmt: skip
+            x.append(got.y[:, -1])
+        return np.array(x)[:, 0]
+
+    def with_law(law: str, *numbers: float) -> Array:
+        theta = neutral.copy()
+        theta[index[law]] = numbers
+        return np.asarray(bound.run(theta[None])[0, 0])
+
+    assert bound.run(neutral[None])[0, 0] == pytest.approx(reference(), abs=2e-3)
+    assert with_law("speed.viscous", 1.5) == pytest.approx(reference(viscous=1.5), abs=2e-3)
+    assert with_law("speed.force_offset", 0.4) == pytest.approx(reference(offset=0.4), abs=2e-3)
+    assert with_law("speed.spring", 3.0) == pytest.approx(reference(spring=3.0), abs=2e-3)
+    assert not any(n.startswith("way.") for n in index)  # a displacement is the integral of its velocity
+    units = {p.name: p.unit for e in bound.stage.effects if e.name == "speed.viscous" for p in e.parameters}
+    assert list(units.values()) == ["(N)/(m/s)"]
+
+
+def test_a_machine_in_windows_begins_each_where_it_was_measured() -> None:
+    f = np.repeat(white(4, 5), 10)
+    t = SHORT
+    way = 0.3 * np.cos(3.0 * t)  # another motion than the model's: within a window it leaves it
+    free = BoundSystem(machine(window=0.8), [record(t, f=f, way=way)])
+    y = free.run(free.stage.neutral()[None])[0, 0]
+    first = np.flatnonzero(free.data.restarts(0, 50)[0])
+    assert first.tolist() == [0, 10, 20, 30, 40] and y[first] == pytest.approx(way[first])
+    v = free.data.restarts(0, 50)[1][1]
+    for k in first[1:-1]:
+        got = scipy.integrate.solve_ivp(
+            lambda s, x: [x[1], (f[min(int((s + 1e-9) / 0.08), 49)] - 8.0 * x[0]) / 2.0],
+            [t[k], t[k + 9]], [way[k], v[k]], rtol=1e-7, max_step=0.02,
+        )  # fmt: skip
+        assert y[k + 9] == pytest.approx(got.y[0, -1], abs=3e-3)
+
+
+def test_a_frequency_is_found_from_short_windows_where_a_free_run_loses_its_phase() -> None:
+    t = 0.08 * np.arange(100)
+    system = machine(
+        parameters=[Parameter("m", 2.0, "kg"), unknown("k", 30.0, "N/m")], places=["f"], start={"speed": 0.0}
+    )
+    log = record(t, f=np.zeros(100), way=0.3 * np.cos(np.sqrt(8.0 / 2.0) * 1.5 * t) + 1e-4 * white(1, 100))
+    bound = BoundSystem(system, [log])
+    assert bound.stage.parameters[1].value == pytest.approx(8.0 * 1.5**2, rel=0.01)
+    assert bound.runner.steps in (2, 4, 8, 16) and bound.data.window is None
+
+
+@pytest.mark.parametrize("c", [0.5, 12.0])
+def test_an_integration_takes_as_many_steps_as_its_rate_needs(c: float) -> None:
+    system = System(
+        "lag", "simulate", decay, {"y": "V"}, {"u": "V"}, [Parameter("c", c, "1/s")], states={"y": "V"},
+        start={"y": 0.7}, places=["u"],
+    )  # fmt: skip
+    log = driven_decay(1, 0.7, c)
+    bound = BoundSystem(system, [log])
+    y = bound.run(bound.stage.neutral()[None])[0, 0]
+    assert y == pytest.approx(log.columns["y"], abs=3e-3 * np.std(log.columns["y"]))
+    assert bound.runner.steps == {0.5: 1, 12.0: 2}[c]
+
+
+def test_springs_that_carry_a_force_at_the_start_are_said() -> None:
+    """A damper and a spring with friction, held by 3 N where the log begins."""
+    t = 0.01 * np.arange(400)
+    x, v = 0.5 * np.cos(2.0 * t), -np.sin(2.0 * t)
+    spring = np.empty(400)
+    spring[0] = 3.0
+    for k in range(1, 400):
+        spring[k] = np.clip(spring[k - 1] + 20.0 * (x[k] - x[k - 1]), -3.0, 3.0)
+    log = record(t, x=x, v=v, f=v + spring + 1e-3 * white(2, 400))
+
+    def bound_of(start: str) -> tuple[BoundSystem, Array]:
+        system = System(
+            "damper", "force", lambda u, p: p.c * u.velocity, {"f": "N"}, velocity="v", position="x",
+            parameters=[Parameter("c", 1.0, "N s/m")], start_force=start,
+        )  # fmt: skip
+        bound = BoundSystem(system, [log])
+        theta = bound.stage.neutral()
+        theta[bound.stage.index()["force.elastic_plastic"]] = 20.0, 3.0
+        return bound, theta
+
+    (unloaded, theta), (measured, _) = bound_of("unloaded"), bound_of("measured")
+    assert unloaded.run(theta[None])[0, 0][:5] - v[:5] == pytest.approx(20.0 * (x - x[0])[:5], abs=1e-6)
+    assert measured.run(theta[None])[0, 0] - v == pytest.approx(spring + (measured.data.held(0) - 3.0), abs=0.07)
+    judge = LeastSquaresProblem(unloaded.thinned, unloaded.floor)
+    d = as_given(Logs(unloaded, None), judge.fit((), unloaded.stage.neutral()))
+    assert _loaded(unloaded, judge, d) == []  # no spring
+    d.final = judge.fit(("force.elastic_plastic",), theta, 12)
+    (said,) = _loaded(unloaded, judge, d)
+    words = re.fullmatch(
+        r'force.elastic_plastic taken as unloaded at the start, where 2.95 N was measured; with start_force="measured" '
+        r"the error goes from (\S+) to (\S+) N(, elastic_plastic \w+ \S+ to \S+)*",
+        said,
+    )
+    assert words is not None and float(words[1]) > 10.0 * float(words[2]) and not unloaded.runner.loaded
+    assert float(words[1]) == pytest.approx(rms(unloaded.errors(d.final.theta)["log"]), rel=0.01)
+    assert _loaded(measured, judge, d) == []
+
+
+# ---- the run that tells rivals apart ---------------------------------------------------------------------------------
+
+
+def rivals_of(bound: BoundSystem, right: str, wrong: str) -> Any:
+    """A diagnosis that has named one law, where another is as likely, each with its fit."""
+    judge = LeastSquaresProblem(bound.thinned, bound.floor)
+    fits = {name: judge.fit((name,), bound.stage.neutral(), 12) for name in (right, wrong)}
+    named = SimpleNamespace(effect=right, rivals=[wrong, "unfitted"], fits={wrong: fits[wrong]})
+    left = np.array([0.02])
+    return SimpleNamespace(effects=[named], final=fits[right], error_after=left, floor=0.5 * left)
+
+
+def test_a_run_tells_rivals_apart_by_the_error_with_the_wrong_one() -> None:
+    u = 0.6 + 0.3 * np.sin(T)
+    system = mapping(parameters=[unknown("a", 1.0, "V/A")])
+    log = record(T, u=u, y=2.0 * u + 0.4 * u**3 + 0.01 * white(4, 60))
+    bound = BoundSystem(system, [log])
+    d = rivals_of(bound, "u.cubic", "y.bias")
+    bench = _Bench(bound, Limits({"u": (-1.0, 2.0)}))
+    rivals = _Rivals(bench, d)
+    assert rivals.left.tolist() == [0.02] and len(rivals.pairs) == 1 and rivals.pairs[0][2] == ()
+    run = bench.of_shape(SHAPES["one slow ramp up and down"], 1.0)
+    c = d.final.theta[bound.stage.index()["u.cubic"]][0]
+    a, b = (fit.theta[0] for fit in (d.final, d.effects[0].fits["y.bias"]))
+    offset = d.effects[0].fits["y.bias"].theta[bound.stage.index()["y.bias"]][0]
+    x = run["u"]
+    one = by_hand([x, np.ones(len(x))], a * (x + c * x**3))
+    two = by_hand([x, x**3], b * x + offset)
+    (told,) = rivals.told(run) or [np.nan]
+    floors = [float(Data(system, [record(bench.t, u=x, y=y)]).noise()[0]) for y in (a * (x + c * x**3), b * x + offset)]
+    wanted = [0.5 * np.log(1.0 + np.mean(e**2) / max(0.02, f) ** 2) for e, f in zip((one, two), floors, strict=True)]
+    assert told == pytest.approx(min(wanted), rel=0.1)
+    noisy = rivals.told(run, 1)
+    assert noisy is not None and noisy != [told] and noisy[0] == pytest.approx(told, abs=0.5)
+    assert rivals.told({"u": np.zeros(len(x))}) == [pytest.approx(0.0, abs=0.7)]
+    limited = _Rivals(_Bench(bound, Limits({"u": (-1.0, 2.0), "y": (0.0, 1.0)})), d)
+    assert limited.told(run) is None and limited.checked(run, [0]).startswith("in 0 of 0 simulations")
+    assert rivals.row(0.7) == pytest.approx(np.exp(0.7))
+    checked = rivals.checked(run, [0])
+    words = re.fullmatch(r"in (\d) of 4 simulations with noise the right law is told, whichever it is", checked)
+    assert words is not None and (int(words[1]) == 4) == (told > 0.5)
+    far, near = rivals.goal + 1.0, rivals.goal - 0.1
+    assert rivals.text("ramps", far, 9.0, "so", [0]) == (
+        f"To distinguish u.cubic from y.bias: ramps, 9 s; the wrong law then leaves {np.exp(far):.2f} times the error "
+        "of the right one; so."
+    )
+    assert rivals.text("ramps", near, 9.0, "", [0]) == (
+        f"No run within the limits separates u.cubic from y.bias. With the best, ramps, the wrong law leaves "
+        f"{np.exp(near):.2f} times the error of the right one; {np.exp(rivals.goal):.2f} times is required."
+    )
+
+
+def test_the_best_run_of_the_bank_is_recommended_and_improved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is told here is how far a run's mean is from 0, where no run may go beyond 2; shifts help a little."""
+    bound = straight_line()
+    asked: list[tuple[str, int]] = []
+
+    def told(self: Any, run: dict[str, Array], draw: int = 0) -> list[float] | None:
+        return None if np.abs(run["u"]).max() > 2.0 else [float(np.mean(np.abs(run["u"]))), 0.1]
+
+    monkeypatch.setattr(_Rivals, "told", told)
+    monkeypatch.setattr(_Rivals, "checked", lambda self, run, of: asked.append(("checked", len(of))) or "so")
+    monkeypatch.setattr(_Rivals, "goal", 0.5)
+    d = rivals_of(bound, "u.cubic", "u.saturation")
+    d.effects.append(SimpleNamespace(effect="u.saturation", rivals=["u.cubic"], fits={"u.cubic": d.final}))
+    done: list[float] = []
+    got = recommend(bound, d, Limits({"u": (-3.0, 3.0)}, seconds=6.0), done.append)
+    assert done[-1] == 1.0 and done == sorted(done) and asked == [("checked", 1)]  # what no run tells is not asked
+    table = got["table"]
+    scores = [row["score"] for row in table]
+    assert scores == sorted(scores, reverse=True) and got["score"] == scores[0] and got["separates"]
+    assert got["profile"].endswith(", parts of it shifted") and got["profile"] == table[0]["profile"]
+    assert table[0]["profile"].startswith("30 steps between the ends at random, 50 % of the range")
+    assert {row["profile"].split(",")[0] for row in table} >= {"the log's own again", "one slow ramp up and down"}
+    assert all(row["told"] == pytest.approx(np.exp(row["score"])) for row in table) and got["heads"] == _Rivals.heads
+    unit, u = got["inputs"]["u"]
+    assert unit == "A" and np.mean(np.abs(u)) == pytest.approx(got["score"]) and np.abs(u).max() <= 2.0
+    assert np.count_nonzero(u != np.clip(u, -1.5, 1.5)) > 0 and got["t"] == pytest.approx(0.1 * np.arange(61))
+    monkeypatch.setattr(_Rivals, "goal", 5.0)
+    none = recommend(bound, d, Limits({"u": (-3.0, 3.0)}, seconds=6.0))
+    assert not none["separates"] and none["text"].startswith("No run within the limits separates u.cubic from ")
+    with pytest.raises(InputError, match="^system 'map': no run of the bank keeps its outputs within the limits$"):
+        recommend(bound, d, Limits({"u": (9.0, 10.0)}, seconds=6.0))
+
+
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [
+        (Limits({"v": (0.0, 1.0)}), "limit 'v': allowed: u, y"),
+        (Limits({}, {"y": 1.0}), "rate 'y': allowed: u"),
+        (Limits({}, {}, 4.8), "a run of 4.8 s has 48 samples; allowed: 50 or more"),
+    ],
+)
+def test_limits_that_cannot_be_get_one_line(limits: Limits, said: str) -> None:
+    with pytest.raises(InputError) as e:
+        _Bench(straight_line(), limits)
+    assert str(e.value) == said
+    bench = _Bench(straight_line(), Limits(seconds=5.0))
+    assert len(bench.t) == 51 and bench.ranges == {"u": pytest.approx((0.3, 0.9), abs=0.01)}
+    assert bench.usual["y"] == pytest.approx(np.interp(np.linspace(0.0, T[-1], 51), T, bench.bound.measured[0]))
+    assert bench.log_again["u"] == pytest.approx(np.interp(np.linspace(0.0, T[-1], 51), T, bench.bound.data.u[0][0]))
+    assert driven(mover()) == {"x": "mm"} and driven(mapping()) == {"u": "A"}
+    assert driven(mover(position=None, velocity="v")) == {"v": ""}

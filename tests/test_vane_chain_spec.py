@@ -89,6 +89,7 @@ from vaneloop.identification.vane_chain.parameters import (
     FREE,
     _starts,
     declared,
+    lanes,
     like_temperature,
     like_time,
 )
@@ -1384,3 +1385,108 @@ def test_a_law_that_the_machine_has_needs_its_channel(machine_log: Log, chain: C
     by_law, by_bias = stage.run(stage.neutral()[None])[0, 0], without.run(theta[None])[0, 0]
     assert by_law == pytest.approx(by_bias, abs=1e-3)
     assert np.abs(by_law - without.run(without.neutral()[None])[0, 0]).max() > 0.01
+
+
+# ---- commands in frames, other clocks
+
+
+def test_a_command_in_frames_is_the_one_that_the_controller_had_in_its_tick() -> None:
+    ticks, n = 0.01 * np.arange(1000), np.arange(1000.0)
+    kept = np.ones(1000, dtype=bool)
+    kept[300:306] = kept[500] = False  # six frames lack, and one
+    frames = Channel(ticks[kept] + 0.004, 50.0 + 0.01 * n[kept], framed=True)
+    log = log_of(
+        n_dem=(ticks, 0.02 * n),
+        n_r=(ticks + 0.004, 1.0 + 0.02 * n),
+        x_dem=(ticks, 5.0 + 0.01 * n),
+        x_lvdt=(ticks, 0.01 * n),
+    )
+    log = Log("a.csv", log.channels | {"n_dem": frames})
+    grid = grid_of(log)
+    rows, columns, gaps, _ = on_raster(log, grid)
+    at = np.rint((rows + grid.start) / 0.01).astype(int)  # in tick k the controller has the frame of k - 1
+    last = np.maximum.accumulate(np.where(kept, n, -1.0))
+    assert columns["n_dem"] == pytest.approx(50.0 + 0.01 * last[np.maximum(at - 1, 0)])
+    assert columns["x_lvdt"] == pytest.approx(0.01 * at, abs=1e-9)
+    lost = np.flatnonzero(gaps.lost["n_dem"])
+    assert set(at[lost].tolist()) == {*range(301, 307), 501}
+    assert at[np.flatnonzero(gaps.far["n_dem"])].tolist() == [303, 304, 305, 306]  # two frames are bridged
+    assert at[np.flatnonzero(~gaps.fresh(["n_dem"])[0])].tolist() == list(range(301, 307))
+    whole = on_raster(Log("a.csv", log.channels | {"n_dem": Channel(ticks + 0.004, 0.02 * n, framed=True)}), grid)[2]
+    assert "n_dem" not in whole.far and "n_dem" not in whole.lost
+
+
+def test_a_log_faster_than_the_frames_begins_with_one() -> None:
+    """Every 2 ms a sample; commands change with the frame, 6 ms behind the log's first sample."""
+    t = 7.0 + 0.002 * np.arange(5001)
+    frame = np.floor((t - 7.006) / 0.01 + 1e-6)
+    i = white(2, 5001)
+    log = log_of(
+        t, x_dem=20.0 + np.sin(0.1 * frame), n_dem=60.0 + np.cos(0.1 * frame), n_r=t, x_lvdt=np.sin(t), i_cmd=i
+    )
+    grid = grid_of(log)
+    assert grid.start == pytest.approx(7.006) and grid.dt == 0.01 and grid.rows == 1000
+    rows, columns, gaps, _ = on_raster(log, grid)
+    assert columns["x_dem"] == pytest.approx(20.0 + np.sin(0.1 * np.arange(1000.0)))
+    assert (
+        columns["n_r"] == pytest.approx(7.006 + rows)
+        and not gaps.far
+        and columns["x_lvdt"] == pytest.approx(np.sin(7.006 + rows))
+    )
+    wanted = i[4:][: 5 * 999].reshape(-1, 5).mean(axis=1)  # the mean of the five samples up to each row
+    assert columns["i_cmd"][1:] == pytest.approx(wanted)
+    still = grid_of(log_of(t, x_dem=np.where(t < 10.0, 20.0, 21.0), n_dem=0.0 * t, n_r=t, x_lvdt=t))
+    assert still.start == 7.0  # one change tells no phase
+    moves = grid_of(log_of(t, x_dem=t, n_dem=t, n_r=t, x_lvdt=t))
+    assert moves.start == 7.0  # what changes with every sample came in no frames
+
+
+def test_samples_of_another_clock_are_joined_and_a_jitter_is_not() -> None:
+    t = 0.01 * np.arange(2000)
+    jitter = t + 2e-4 * white(1, 2000).clip(-3.0, 3.0)
+    slope = log_of(x_lvdt=(t, t), vigv=(jitter, 0.01 * np.arange(2000.0)), vgv1=(t + 0.004, t + 0.004))
+    columns = on_raster(slope, grid_of(slope)._replace(start=0.0, rows=1999))[1]
+    assert columns["vigv"] == pytest.approx(0.01 * np.arange(1999.0))  # each row its own sample
+    assert columns["vgv1"][1:] == pytest.approx(t[1:1999])  # between two of them by a line
+
+
+# ---- laws that remember, and the next run
+
+
+def test_a_hysteresis_slips_by_the_whole_course_of_what_moves_it(chain: Chain) -> None:
+    driven = driven_of(chain.stage("linkage"))
+    law = curve_effect("law", learned("linkage.ring", "adds", "stops_of_x_lvdt", 0.0, 10.0, 0.0, 0.4, 0.6, 0.7))
+    stage = remade(chain.stage("linkage"), (), [law])
+    thetas = np.array([stage.neutral()] * 3)
+    thetas[1:, -1] = 1.0, 2.0
+    with_laws_of = driven_of(stage)
+    p = lanes(with_laws_of, thetas, np.zeros(0, dtype=int), np.zeros(0))
+    signals = with_laws_of.signals()
+    given = with_laws_of.slipping(signals, p)
+    assert len(given) == KNOWN + 3 and not given[KNOWN].any()
+    assert np.array_equal(given[:KNOWN], signals[:KNOWN], equal_nan=True)
+    assert given[KNOWN + 2] == pytest.approx(2.0 * given[KNOWN + 1])
+    # on the way up it is the virgin curve; a way back and forth takes power
+    x, h = driven.columns["stroke"], given[KNOWN + 1]
+    assert np.sum(0.5 * (h[1:] + h[:-1]) * np.diff(x)) > 0.0 and np.corrcoef(x, h)[0, 1] > 0.5
+    at = np.r_[600:1100, 1500:2000]
+    part = with_laws_of.at(at, {k: v[at] for k, v in driven.columns.items()}, driven.run[at])
+    assert part.slipping(part.signals(), p)[KNOWN:] == pytest.approx(given[KNOWN:, at])
+    assert driven.slipping(signals, driven.machine.p) is signals
+    still, one, two = stage.run(thetas)[:, 0]
+    assert np.abs(two - one - (one - still)).max() < 0.2 * np.abs(one - still).max() and np.ptp(one - still) > 0.1
+
+
+def test_a_simulated_run_tells_the_law_that_it_has_from_its_rival() -> None:
+    t = 0.01 * np.arange(900)
+    profile = 75.0 + 12.0 * np.sin(0.5 * t) + 3.0 * np.sign(np.sin(2.0 * t))
+    truth = {"valve_lag": {"time_constant": 0.08}}
+    nats, spreads = experiment.divergence(profile, truth, "actuator", "valve_null_bias", "valve_lag")
+    assert nats > 100.0 and spreads > 1.0
+    wrong = experiment.divergence(profile, truth, "actuator", "valve_lag", "valve_null_bias")
+    assert wrong[0] < -100.0 and wrong[1] == 0.0
+    assert experiment.divergence(profile, truth, "nothing", "valve_lag", "lvdt_lag") == (0.0, 0.0)
+    assert experiment.divergence(profile, truth, "actuator", "valve_null_bias", "valve_lag", seed=2)[0] != nats
+    # with the law that it has beside them, neither rival says more
+    both = experiment.divergence(profile, truth, "actuator", "valve_null_bias", "lvdt_bias", ("valve_lag",))
+    assert abs(both[0]) < 0.1 * nats
