@@ -996,14 +996,14 @@ def test_the_stroke_without_its_noise_and_the_law_on_it_are_as_far_off_as_is_sai
     driven, k = driven_of(chain.stage("actuator")), CALIBRATION.scalars
     t, c = driven.t, driven.columns
     known = without_noise(t, c, driven.machine)
-    for sigma in (0.005, 0.02):
+    for sigma, rows in ((0.001, 25), (0.002, 41), (0.02, 41)):
         x = known.stroke + sigma * white(7, len(t))
         smooth = without_noise(t, c | {"x_lvdt": x}, driven.machine)
-        assert smooth.noise == pytest.approx(sigma, rel=0.06) and smooth.rows == 41
-        assert smooth.off == pytest.approx(x - (smooth.stroke - _smoothed(smooth.off, 41)), abs=1e-9)
+        assert smooth.noise == pytest.approx(sigma, rel=0.06) and smooth.rows == rows
+        assert smooth.off == pytest.approx(x - (smooth.stroke - _smoothed(smooth.off, rows)), abs=1e-9)
         left = np.std((smooth.stroke - known.stroke)[100:-100])
         said = [np.std(smooth.left(np.random.default_rng(s))[100:-100] + smooth.distortion[100:-100]) for s in range(4)]
-        assert left < 0.35 * sigma and np.sqrt(np.mean(np.square(said))) == pytest.approx(left, rel=0.25)
+        assert left < 0.45 * sigma and np.sqrt(np.mean(np.square(said))) == pytest.approx(left, rel=0.15)
     law, of_mean, of_some = servo_law(t, c | {"x_lvdt": x}, CALIBRATION, smooth, draws=4, samples=2)
     unknown = sigma * white(9, len(t), 10)
     unknown[:, -1] = 0.0  # at the row it is logged
@@ -1490,3 +1490,100 @@ def test_a_simulated_run_tells_the_law_that_it_has_from_its_rival() -> None:
     # with the law that it has beside them, neither rival says more
     both = experiment.divergence(profile, truth, "actuator", "valve_null_bias", "lvdt_bias", ("valve_lag",))
     assert abs(both[0]) < 0.1 * nats
+
+
+def test_a_gap_of_one_vane_is_none_of_the_others(machine_log: Log, chain: Chain) -> None:
+    v = machine_log["vigv"]
+    kept = np.ones(2400, dtype=bool)
+    kept[1500:1520] = False
+    stage = chain_of(with_(machine_log, vigv=Channel(v.t[kept], v.values[kept]))).stage("linkage")
+    lost = np.isfinite(chain.stage("linkage").measured) & ~np.isfinite(stage.measured)
+    assert np.flatnonzero(lost[0]).tolist() == list(range(1500, 1520)) and not lost[1:].any()
+
+
+def test_of_channels_that_end_in_one_row_the_first_is_named(machine_log: Log) -> None:
+    p_s, t_oil = machine_log["p_s"], machine_log["t_oil"]
+    ends = with_(
+        machine_log, p_s=Channel(p_s.t[:1900], p_s.values[:1900]),
+        t_oil=Channel(t_oil.t[:1900] + 0.004, t_oil.values[:1900]),
+    )  # fmt: skip
+    assert list(chain_of(ends).notes) == [
+        "p_s ends at 18.99 s: actuator not judged after it", "t_oil ends at 18.994 s: linkage not judged after it"
+    ]  # fmt: skip
+    begins = with_(
+        machine_log, p_s=Channel(p_s.t[500:], p_s.values[500:]),
+        t_oil=Channel(t_oil.t[500:] - 0.004, t_oil.values[500:]),
+    )  # fmt: skip
+    assert "p_s begins at 5 s: actuator not judged before it" in chain_of(begins).notes
+
+
+def test_a_vane_that_begins_late_leaves_the_others_as_they_are(machine_log: Log, chain: Chain) -> None:
+    v = machine_log["vigv"]
+    late = build_chain(with_(machine_log, vigv=Channel(v.t[800:], v.values[800:])))
+    stage = late.stage("linkage")
+    seen, before = (np.isfinite(s.measured).sum(axis=1).tolist() for s in (stage, chain.stage("linkage")))
+    assert seen == [1600, *before[1:]]
+    assert stage.run(stage.neutral()[None])[0, 1:] == pytest.approx(
+        chain.stage("linkage").run(chain.stage("linkage").neutral()[None])[0, 1:]
+    )
+    source = VaneChainCandidates(late.stage("actuator"), others=[stage])
+    law = curve_effect("law", learned("sensors.lvdt", "adds", "x_lvdt", 2.0, 40.0, -2.0, 1.0, -1.0, 2.0))
+    assert source.elsewhere([law], source.stage((), [law]).neutral()) == {}
+
+
+def test_a_curve_in_the_servo_changes_its_current_by_its_value(chain: Chain) -> None:
+    stage = chain.stage("servo")
+    for how, of in (("adds", "x_dem"), ("times", "n_r")):
+        law = curve_effect("law", learned("servo.current", how, of, 0.0, 100.0, 0.1, 0.1, 0.1, 0.1))
+        with_it = remade(stage, ("controller_gain_error",), [law])
+        thetas = np.array([with_it.neutral()] * 3)
+        thetas[1, -1], thetas[2, 0] = 3.0, 2.0
+        still, by, twice = with_it.run(thetas)[:, 0]
+        assert by == pytest.approx(still + 0.3 if how == "adds" else 1.3 * still)
+        assert twice == pytest.approx(2.0 * still)
+    law = curve_effect("law", learned("controller.demand", "adds", "n_r", 0.0, 100.0, 0.1, 0.1, 0.1, 0.1))
+    demand = remade(chain.stage("demand"), (), [law])
+    thetas = np.array([demand.neutral()] * 2)
+    thetas[1, -1] = 4.0
+    still, by = demand.run(thetas)[:, 0]
+    assert by[500:] == pytest.approx(still[500:] + 0.4, abs=0.05)  # mm, but for the rate limit
+
+
+def test_a_machine_s_own_value_of_a_parameter_is_where_its_fit_begins() -> None:
+    plain = build_plant()
+    nominal = {n.name: n for n in plain.nominal}
+    names = ("actuator.flow_gain", "linkage.vigv_play", "engine.lag", "sensors.vgv1_bias")
+    changed = Model(parameters={n: nominal[n].value + 0.4 * nominal[n].tolerance for n in names}).plant(plain)
+    none = np.zeros(0)
+    for machine, more in ((plain, 0.0), (changed, 0.4)):
+        driven = Driven(none, {}, machine, CALIBRATION, (), none, ())
+        found = {p.name: p for s in ("engine", "actuator", "linkage") for p in declared(s, driven)[0]}
+        for name in names:
+            n, p = nominal[name], found[name]
+            assert p.middle == n.value and p.value == pytest.approx(n.value + more * n.tolerance, rel=1e-9), name
+        if not more:
+            assert all(p.value == nominal[name].value for name, p in found.items())  # to the last bit
+
+
+def test_rivals_are_judged_with_the_other_effects_of_their_subsystem(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def divergence(profile: Array, truth: Any, stage: str, rival: str, named: str, beside: Any, **machine: Any) -> Any:
+        seen.append((stage, rival, named, beside, machine))
+        return 1.0, 1.0
+
+    monkeypatch.setattr(experiment, "divergence", divergence)
+    monkeypatch.setattr(experiment, "profiles", lambda: {"one": np.zeros(10)})
+    lag, bias = (
+        SimpleNamespace(effect=e, rivals=r, parameters={"time_constant": {"value": v}, "of_no_effect": {"value": 1.0}})
+        for e, r, v in (("valve_lag", ["lvdt_lag", "lvdt_bias", "a", "b"], 0.1), ("lvdt_bias", [], 2.0))
+    )
+    d = SimpleNamespace(stages=[SimpleNamespace(stage="actuator", effects=[lag, bias])])
+    of = SimpleNamespace(plant="plant", built="tables")
+    assert experiment.recommend(d, None, of) is not None
+    machine = {"plant": "plant", "calibration": "tables"}
+    assert seen == [
+        ("actuator", "lvdt_lag", "valve_lag", ("lvdt_bias",), machine),
+        ("actuator", "lvdt_bias", "valve_lag", (), machine),
+        ("actuator", "a", "valve_lag", ("lvdt_bias",), machine),
+    ]  # fmt: skip

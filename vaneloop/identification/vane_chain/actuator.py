@@ -81,7 +81,7 @@ def actuator_stage(driven: Driven) -> Stage:
 
     def kept(at: Array) -> Array:
         keep = run[at]
-        for b in np.flatnonzero(np.diff(at, prepend=at[0] - 2) != 1):  # the spool and the lags come from another time
+        for b in np.flatnonzero(np.diff(at, prepend=at[0]) != 1):  # the spool and the lags come from another time
             keep[b : b + window] = False
         return keep
 

@@ -237,7 +237,7 @@ def samples_of(ticks: Array, samples: int) -> Array:
     return np.asarray(ticks[:, np.ceil(10.0 / samples * np.arange(1, samples + 1)).astype(int) - 1].mean(axis=1))
 
 
-def other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Calibration, samples: int = 1) -> str:
+def other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Calibration, samples: int) -> str:
     """Where the log's current is not the mean of the ticks since the row before, the one at the row included, put that
     in its place.
 

@@ -38,6 +38,7 @@ HEADS = {
 
 
 def _piecewise(points: list[tuple[float, float]]) -> np.ndarray:
+    """Straight lines between points (s, %); before the first it stands."""
     t, n = np.array(points).T
     return np.interp(np.arange(0.0, t[-1], 0.01), t, n)
 
@@ -50,28 +51,26 @@ def _sine(middle: float, size: float, low_hz: float, high_hz: float, seconds: fl
 @cache
 def profiles() -> dict[str, np.ndarray]:
     """Safe profiles of the rotor speed's demand, %, every 10 ms, by what they are."""
-    stairs: list[tuple[float, float]] = [(0, 60)]
+    stairs: list[tuple[float, float]] = [(4, 60)]
     for k, n in enumerate([65, 70, 75, 80, 85, 90, 95, 99, 95, 90, 85, 80, 75, 70, 65, 60]):
         stairs += [(4 + 7 * k, stairs[-1][1]), (5 + 7 * k, n)]
-    slams: list[tuple[float, float]] = [(0, 55)]
+    slams: list[tuple[float, float]] = []
     for k in range(4):
         slams += [(5 + 30 * k, 55), (5.2 + 30 * k, 98), (20 + 30 * k, 98), (20.2 + 30 * k, 55), (35 + 30 * k, 55)]
-    small: list[tuple[float, float]] = [(0, 80)]
+    small: list[tuple[float, float]] = []
     for k in range(24):
         small += [(2 + 4 * k, 80), (2.2 + 4 * k, 80 + (1.5 if k % 2 else -1.5) * (1 + k / 8)), (4 + 4 * k, 80)]
     return {
-        "slow ramp up and down over the whole range": _piecewise([(0, 45), (3, 45), (60, 100), (63, 100), (120, 45)]),
+        "slow ramp up and down over the whole range": _piecewise([(3, 45), (60, 100), (63, 100), (120, 45)]),
         "fast ramps over the whole range": _piecewise(
-            [(0, 50), (3, 50), (11, 99), (14, 99), (22, 50), (25, 50), (33, 99), (41, 50), (60, 50)]
+            [(3, 50), (11, 99), (14, 99), (22, 50), (25, 50), (33, 99), (41, 50), (60, 50)]
         ),
         "slams between 55 and 98 %": _piecewise(slams),
         "stairs of 5 % with dwells": _piecewise(stairs),
         "small reversals about 80 %": _piecewise(small),
         "swept sine, 2 % about 82 %, 0.05 to 1.5 Hz": _sine(82.0, 2.0, 0.05, 1.5, 100.0),
         "swept sine, 6 % about 80 %, 0.02 to 0.5 Hz": _sine(80.0, 6.0, 0.02, 0.5, 100.0),
-        "dwells at 50, 80 and 99 %": _piecewise(
-            [(0, 50), (30, 50), (36, 80), (66, 80), (70, 99), (100, 99), (106, 50)]
-        ),
+        "dwells at 50, 80 and 99 %": _piecewise([(30, 50), (36, 80), (66, 80), (70, 99), (100, 99), (106, 50)]),
     }
 
 
