@@ -168,6 +168,10 @@ def test_logs_follow_each_other_on_one_time_axis_under_names_of_their_own() -> N
     assert list(conditions) == ["time", "u", "y", "log"]
     assert units == {"time": "s", "u": "A", "y": "V", "log": ""}
     assert conditions["log"].tolist() == [1.0] * 60 + [2.0] * 60 + [3.0] * 60
+    assert np.array_equal(conditions["u"], np.tile(U, 3))  # rows of a static model may be in any order
+    noisy = U + 0.01 * white(1, 60)
+    moving = Data(turning(), [record(u=noisy, angle=Y)]).regimes()[0]
+    assert not np.array_equal(moving["u"], noisy) and moving["u"] == pytest.approx(U, abs=0.1)
     assert list(Data(mapping(), [record(u=U, y=put(Y, 3), ordered=False)]).regimes()[0]) == ["u", "y"]
 
 
@@ -872,6 +876,7 @@ def test_a_state_that_a_system_forgets_at_once_starts_at_its_reading() -> None:
 def lag_with_curves() -> BoundSystem:
     curves = {
         "drain": learned("state adds", "y", "y", values=[0.5]),
+        "beside": learned("state adds", "y", "y_minus_u", values=[0.5]),
         "slower": learned("parameter times", "c", "time", form="constant", values=[-0.25]),
         "more": learned("input times", "u", "time", form="constant", values=[0.5]),
         "both": learned(
@@ -902,6 +907,7 @@ def integrated(rate: Any, u: Array, begin: float) -> Array:
     [
         ("", lambda t, x, u: u - 0.8 * x),
         ("drain", lambda t, x, u: u - 1.3 * x),
+        ("beside", lambda t, x, u: 1.5 * u - 1.3 * x),
         ("slower", lambda t, x, u: u - 0.6 * x),
         ("more", lambda t, x, u: 1.5 * u - 0.8 * x),
         ("both", lambda t, x, u: u - 0.8 * x - 0.1 * x * t),
@@ -926,6 +932,8 @@ def test_what_a_channel_did_before_the_log_is_forgotten_once_the_rest_of_the_cur
     assert lost.tolist() == (0.5 * way >= 0.475 - 1e-9).tolist() and lost.any() and not lost.all()
     assert swings(np.concatenate([q, np.linspace(-3.0, 0.0, 31)[1:]])).tolist() == [4.0] * 51 + [4.0] * 30
     assert not swings(np.zeros(5)).any()
+    ways = np.concatenate([np.linspace(0.0, 1.0, 11), np.linspace(0.9, 0.0, 10), np.linspace(0.1, 5.0, 50)])
+    assert swings(ways) == pytest.approx([1.0] * 20 + [5.0] * 51)
 
 
 def test_the_other_frequency_of_a_wave_is_found_by_drawing() -> None:
@@ -1079,6 +1087,11 @@ def test_forces_are_compared_up_to_a_frequency_and_not_at_the_ends() -> None:
     own = Data(mover(cutoff=3.0), [record(t, x=x, f=2.0 * a)])
     assert own.cutoff == 3.0 and own.notes == []
     assert d.noise() == pytest.approx([0.01 * np.sqrt(2.0 * d.cutoff * 0.005)], rel=0.4)
+    speed = System("mover", "force", model_of_speed, {"f": "N"}, position="x", parameters=[unknown("c", 1.0, "-")])
+    log = record(t, x=x, v=x, f=2.0 * a)
+    both = System("mover", "force", model_of_speed, {"f": "N"}, velocity="v", parameters=[unknown("c", 1.0, "-")])
+    cutoffs = [Data(s, [log]).cutoff for s in (speed, mover(velocity="v"), both)]
+    assert [c is None for c in cutoffs] == [False, False, True]  # what is differentiated is so up to some frequency
 
 
 # ---- what a user writes ----------------------------------------------------------------------------------------------
@@ -1244,7 +1257,12 @@ def test_an_own_law_of_a_force_and_one_that_remembers_are_tried_too() -> None:
     size = Size(-1.0, 3.0, 1.0, 2.0, 0.1, 6.0, unit="m", force=7.0, speed=2.0, travel=0.5)
     try_law(Law("own", "force", pull, [Parameter("by", 0.0, "N", -5.0, 5.0)], [2.0]), "force", size)
     v, x, t = np.array(seen).T.reshape(3, 2, 9)
-    assert np.array_equal(v[0], v[1]) and v[0].max() == 3.0 == -v[0].min() and t[0] == pytest.approx(0.1 * np.arange(9))
+    assert (
+        np.array_equal(v[0], v[1])
+        and v[0][0] == v[0][-1] == 0.0
+        and v[0].max() == 3.0 == -v[0].min()
+        and t[0] == pytest.approx(0.1 * np.arange(9))
+    )
     assert (x[0].min(), x[0].max()) == (-0.5, 0.5) and np.diff(x[0]) == pytest.approx(np.full(8, 0.125))
     steps: list[float] = []
 
@@ -1629,3 +1647,29 @@ def test_limits_that_cannot_be_get_one_line(limits: Limits, said: str) -> None:
     assert bench.log_again["u"] == pytest.approx(np.interp(np.linspace(0.0, T[-1], 51), T, bench.bound.data.u[0][0]))
     assert driven(mover()) == {"x": "mm"} and driven(mapping()) == {"u": "A"}
     assert driven(mover(position=None, velocity="v")) == {"v": ""}
+
+
+def test_an_integration_is_as_fine_as_the_fitted_rate_needs() -> None:
+    system = System(
+        "lag", "simulate", decay, {"y": "V"}, {"u": "V"}, [unknown("c", 0.5, "1/s")], states={"y": "V"},
+        start={"y": 0.7}, places=["u"],
+    )  # fmt: skip
+    bound = BoundSystem(system, [driven_decay(1, 0.7, 12.0)])
+    assert bound.stage.parameters[0].value == pytest.approx(12.0, rel=0.01) and bound.runner.steps == 2
+
+
+def test_of_values_that_are_drawn_those_nearest_to_the_logs_are_begun_from() -> None:
+    system = mapping(places=["y"], parameters=[unknown("a", 1.0, "V/A")])
+    bound = BoundSystem(system, [record(u=Q, y=2.5 * Q)])
+    one, wide = np.ones(1), np.array([np.inf])
+    scale = np.array([np.std(2.5 * Q)])
+    drawn = [float(z[0]) for z in bound._drawn(one, [0], one, one, -wide, wide, scale)]
+    off = [abs(z - 2.5) for z in drawn]
+    assert len(drawn) == len(set(drawn)) >= 3 and off[0] < 0.5 and off[:3] == sorted(off[:3])
+    bounded = bound._drawn(one, [0], one, one, np.array([1.0]), np.array([2.0]), scale)
+    assert float(bounded[0][0]) == 2.0  # the nearest within its bounds
+
+
+def test_an_output_that_is_0_all_along_has_a_model() -> None:
+    bound = BoundSystem(mapping(places=["y"]), [record(u=Q, y=0.0 * Q)])
+    assert bound.runner.far == 1e9 and bound.stage.parameters[0].value == pytest.approx(0.0, abs=1e-9)

@@ -116,8 +116,7 @@ def _refined(left: Callable[[Array, Array], Array], begins: Array) -> Array:
         now = left(z[rows] + step, rows)
         costs = np.sum(now * now, axis=1)
         better = costs < cost[rows]
-        gained = np.where(better, cost[rows] - costs, 0.0)
-        little = better & (gained <= FORM_ENOUGH * cost[rows]) | (np.abs(step).max(axis=1) <= FORM_ENOUGH)
+        little = better & (cost[rows] - costs <= FORM_ENOUGH * cost[rows]) | (np.abs(step).max(axis=1) <= FORM_ENOUGH)
         won = rows[better]
         z[won] += step[better]
         rest[won], cost[won] = now[better], costs[better]

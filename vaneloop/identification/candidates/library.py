@@ -28,7 +28,6 @@ class Size:
     fastest     99.9 % quantile of the derivative's magnitude
     step, span  s: median time between samples, length of the longest log
     held        s: median time from one change of the value to the next; 0: not known
-    noise       RMS of the noise in the values
     unit        of the values
     force       RMS of the force (or derivative) that the law adds to
     force_unit  of that
@@ -41,7 +40,6 @@ class Size:
     fastest: float
     step: float
     span: float
-    noise: float = 0.0
     unit: str = "-"
     force: float = 1.0
     force_unit: str = "-"

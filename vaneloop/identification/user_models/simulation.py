@@ -18,7 +18,7 @@ from vaneloop.base.spline_rates import SplineRates
 from vaneloop.identification.candidates import laws
 from vaneloop.identification.candidates.library import Law
 from vaneloop.identification.settings import SHORT_RUN, SPLINE_SAMPLES, STARTS_LOADED, SWITCHED
-from vaneloop.identification.subsystem import Array, StageError
+from vaneloop.identification.subsystem import Array, StageError, size_of
 from vaneloop.identification.user_models.codegen import Dispatch, dispatch_of
 from vaneloop.identification.user_models.data import Data
 from vaneloop.identification.user_models.kernel import Kernel, build_kernels
@@ -99,7 +99,7 @@ class Runner:
         far = np.nanmax(np.abs(data.measured), axis=1) if np.isfinite(data.measured).any() else np.ones(n_out)
         # what is not integrated runs away from nothing: its gain may just start far off
         beyond = 100.0 if s.kind in ("simulate", "closed_loop") else 1e9
-        self.far = beyond * float(np.nanmax(np.where(np.isfinite(far), far, 1.0))) + 1e-300
+        self.far = beyond * size_of(float(np.nanmax(np.where(np.isfinite(far), far, 1.0))))
         self.noise_of_force = float(data.noise()[0]) if s.kind == "force" else 0.0
 
     def _compile(self, like: Runner | None) -> None:
