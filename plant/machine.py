@@ -48,6 +48,13 @@ class Plant:
         return {"p_s": pressure, "t_oil": supply.temperature.value}
 
     @property
+    def usual_within(self) -> dict[str, float]:
+        """Half-width of the plausible interval around each of `usual`, in border units; 0: nobody says."""
+        supply = self.table.supply
+        pressure = supply.pressure.tolerance if isinstance(supply, Supply) else 0.0
+        return {"p_s": pressure, "t_oil": supply.temperature.tolerance}
+
+    @property
     def vanes(self) -> tuple[str, ...]:
         """The machine's stages, in order."""
         return self.geometry.vanes

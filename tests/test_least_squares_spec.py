@@ -87,6 +87,29 @@ def test_errors_are_in_noise_floors_and_free_of_a_constant_in_each_window(
         assert all(of[i] != of[i - 1] for i in judge.block_start[1:])
 
 
+@pytest.mark.parametrize("window", [10.0, 33.0])
+def test_what_inputs_that_nobody_logged_do_in_a_window_is_whitened_by_their_covariance(window: float) -> None:
+    stage, x = made(3, window=window)
+    stage.measured[:, 5:9] = np.nan
+    theta = np.array([[1.0, 0.5, 0.0]])
+    bare = LeastSquaresProblem(stage, FLOOR)
+    centred, starts = bare.errors(theta)[0], bare.window_start
+    stage.unlogged = np.random.default_rng(3).standard_normal((3, 2, N)) * np.array([0.5, 0.0, 2.0])[:, None, None]
+    with_them = LeastSquaresProblem(stage, FLOOR).errors(theta)[0]
+    responses = [bare._whiten(bare.measured - s[None])[0] for s in stage.unlogged]
+    assert starts is not None
+    for first, end in zip(starts, [*starts[1:], N], strict=True):
+        here = slice(first, end)
+        s = np.array([r[:, here].ravel() for r in responses])
+        covariance = np.eye(s.shape[1]) + s.T @ s
+        e, w = centred[:, here].ravel(), with_them[:, here].ravel()
+        assert w @ w == pytest.approx(e @ np.linalg.solve(covariance, e))
+    stage.window = None  # of a stage that begins once they say nothing
+    free = LeastSquaresProblem(stage, FLOOR).errors(theta)
+    stage.unlogged = None
+    assert np.array_equal(free, LeastSquaresProblem(stage, FLOOR).errors(theta))
+
+
 def test_what_the_raster_hides_is_expected_where_it_is_lost() -> None:
     stage, _ = made(1)
     judge = LeastSquaresProblem(stage, FLOOR)

@@ -443,6 +443,7 @@ def test_noise_and_usual_values_are_those_of_the_tables() -> None:
         assert machine.sigma == pytest.approx([1e-3 * sensors.lvdt_noise.value, *[pot] * 3, sensors.speed_noise.value])
         assert machine.usual["t_oil"] == machine.table.supply.temperature.value and machine.vanes == OWN
     assert shipped.usual["p_s"] == value_of("supply.pressure") and electric.usual["p_s"] == 0.0
+    assert shipped.usual_within == {"p_s": 2.1, "t_oil": 40.0} and electric.usual_within == {"p_s": 0.0, "t_oil": 0.0}
     assert shipped.kind == "hydraulic" and electric.kind == "electromechanical"
     assert shipped.p[KIND, 0] == 0.0 and electric.p[KIND, 0] == 1.0 and (shipped.p[VANE_COUNT] == 3.0).all()
     assert not shipped.rows.flags.writeable and set(shipped.rows) != set(electric.rows)

@@ -93,6 +93,21 @@ def test_one_clock_stays_as_it_is():
                                                      if k != "t"}, [])).notes if "stand" in n]  # fmt: skip
 
 
+def test_a_supply_pressure_that_nobody_logged_is_no_missing_physics() -> None:
+    log = rows(SEED)
+    chain = build_chain(Log("few", {k: Channel(log["t"], v) for k, v in log.items() if k not in ("t", "p_s")}, []))
+    stage = chain.stage("actuator")
+    assert compare_stages([stage])[0].ratio == pytest.approx(1.0, abs=0.05)
+    at = np.r_[1000:2000, 5000:6000]
+    assert stage.unlogged is not None and stage.excerpt is not None
+    part = stage.excerpt(at)
+    assert part.unlogged is not None and part.unlogged.shape == (1, 1, 2000)
+    stage.unlogged = None  # taken for exactly known
+    assert compare_stages([stage])[0].ratio > 2.0
+    chain = build_chain(Log("all", {k: Channel(log["t"], v) for k, v in log.items() if k != "t"}, []))
+    assert chain.stage("actuator").unlogged is None
+
+
 @functools.cache
 def fine() -> dict[str, np.ndarray]:
     """A log of the rig with a row each ms."""

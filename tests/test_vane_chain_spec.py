@@ -689,6 +689,8 @@ def test_a_stage_is_made_anew_with_some_laws(chain: Chain) -> None:
     few = remade(stage, ["valve_lag", "lvdt_gain"], ())
     assert {e.name for e in few.effects} == {"valve_lag", "lvdt_gain"} and few.floor is stage.floor
     assert few.regimes is stage.regimes and few.memory == stage.memory and few.raster_error is stage.raster_error
+    demand = chain.stage("demand")
+    assert demand.lost is not None and remade(demand, ["can_delay"], ()).lost is demand.lost
     neutral = stage.run(stage.neutral()[None])
     assert few.run(few.neutral()[None]) == pytest.approx(neutral, abs=1e-12)
     rest = without_laws(chain.stages, ["valve_lag", "nothing"])

@@ -116,6 +116,8 @@ class Stage:
               to be said of it: no name rests on such a reading
     lost      draws of the error that the raster causes in each output, float64[draws, outputs, samples]: it need not
               be even; None: it is
+    unlogged  what one standard deviation of each input that nobody logged does to each output, float64[inputs, outputs,
+              samples]: of a stage with windows, in each of which it has a value of its own; None: there is none
     hidden    function from one parameter set to the RMS of what the raster hides from each output with these
               parameters: an effect may turn on what happens between two rows; None: no more than ``raster_error``
     floor     RMS of an output's error when nothing is missing, in its unit
@@ -154,6 +156,7 @@ class Stage:
     raster_error: Array | None = None
     coarse: Mapping[str, str] = field(default_factory=dict)
     lost: Array | None = None
+    unlogged: Array | None = None
     hidden: Callable[[Array], Array] | None = None
     floor: Array | None = None
     quiet: Array | None = None

@@ -20,7 +20,7 @@ import numpy as np
 
 from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known, LatestSlopes
 from vaneloop.identification.least_squares.levenberg_marquardt import Begin, End, carries, levenberg_marquardt
-from vaneloop.identification.least_squares.residuals import ResidualCache, normalise_residuals
+from vaneloop.identification.least_squares.residuals import ResidualCache, normalise_residuals, whiten_unlogged
 from vaneloop.identification.settings import (
     DIFFERENCE,
     EVIDENCE,
@@ -128,6 +128,10 @@ class LeastSquaresProblem:
         self._bounds = self._limits()
         self._turning = [c for c, p in enumerate(stage.all_parameters()) if p.period > 0.0]
         self._counted = self.valid.astype(float)
+        self._unlogged: list[Array] = []  # responses to inputs that nobody logged, each whitened by those before it
+        for response in () if stage.unlogged is None or not stage.window else stage.unlogged:
+            if np.any(response):
+                self._unlogged.append(self._whiten(self.measured - response[None])[0])
 
     def _scales(self) -> Array:
         """Size of a usual change of each parameter, for difference steps and damping."""
@@ -173,6 +177,8 @@ class LeastSquaresProblem:
         out = np.empty(np.shape(model)) if out is None else out
         starts = self.window_start if self.window_start is not None else np.empty(0, dtype=np.int64)
         normalise_residuals(np.ascontiguousarray(model, float), self.measured, self._counted, self.floor, starts, out)
+        for response in self._unlogged:
+            whiten_unlogged(out, response, starts)
         return out
 
     def block_costs(self, e: Array) -> Array:

@@ -13,7 +13,7 @@ from vaneloop.base.compiled import compiled_free
 from vaneloop.identification.settings import KEPT_ERRORS, NO_ANSWER_ERROR
 from vaneloop.identification.subsystem import Array
 
-__all__ = ["ResidualCache", "normalise_residuals"]
+__all__ = ["ResidualCache", "normalise_residuals", "whiten_unlogged"]
 
 
 @compiled_free
@@ -44,6 +44,38 @@ def normalise_residuals(
                 mean = total / max(many, 1.0)
                 for i in range(starts[w], end):
                     e[i] -= mean * counted[o, i]
+
+
+@compiled_free
+def whiten_unlogged(errors: np.ndarray, response: np.ndarray, starts: np.ndarray) -> None:
+    """Whiten errors e of which an input that nobody logged is a part: in each window a multiple of its response s, the
+    multiple a standard normal number of that window.
+
+    Their covariance there is C = I + s s', with the inverse root::
+
+        C^(-1/2) e = e - (1 - 1 / sqrt(1 + s's)) s (s'e) / (s's)
+
+    errors    [sets, outputs, samples], changed in place; as `normalise_residuals` leaves them
+    response  [outputs, samples], likewise: what one standard deviation of the input does
+    starts    first samples of the windows
+    """
+    sets, outputs, n = errors.shape
+    for w in range(len(starts)):
+        end = starts[w + 1] if w + 1 < len(starts) else n
+        power = 0.0
+        for o in range(outputs):
+            for i in range(starts[w], end):
+                power += response[o, i] * response[o, i]
+        if power > 0.0:
+            share = (1.0 - 1.0 / math.sqrt(1.0 + power)) / power
+            for k in range(sets):
+                along = 0.0
+                for o in range(outputs):
+                    for i in range(starts[w], end):
+                        along += response[o, i] * errors[k, o, i]
+                for o in range(outputs):
+                    for i in range(starts[w], end):
+                        errors[k, o, i] -= share * along * response[o, i]
 
 
 # ---- Errors of the parameter sets that were simulated last: one set in ten is asked for again soon

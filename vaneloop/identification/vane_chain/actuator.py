@@ -35,7 +35,7 @@ def actuator_stage(driven: Driven) -> Stage:
 
     logged = step_currents(i, dt, substeps)
 
-    def simulate(thetas: Array, current: Array = logged, t_oil: Array = t_oil) -> Array:
+    def simulate(thetas: Array, current: Array = logged, t_oil: Array = t_oil, p_s: Array = p_s) -> Array:
         p = lanes(driven, thetas, rows, si)
         derive(p, dt / current.shape[1], dt)
         s = np.zeros((chain.N_STATE, len(thetas)))
@@ -73,6 +73,11 @@ def actuator_stage(driven: Driven) -> Stage:
         force = piston_stiction.scatter(np.gradient(without_jumps(stage, out[0])) * 1e-3 / dt, excess, speed)
         return np.hypot(between, 1e3 * give * float(np.sqrt(np.mean(force[np.isfinite(measured[0])] ** 2))))
 
+    moved = {"p_s": {"p_s": p_s + 1e6 * driven.assumed.get("p_s", 0.0)},
+             "t_oil": {"t_oil": t_oil + driven.assumed.get("t_oil", 0.0)}}  # fmt: skip
+    if unlogged := [moved[name] for name in moved if name in driven.assumed]:
+        as_assumed = simulate(stage.neutral()[None])[0]
+        stage.unlogged = np.array([simulate(stage.neutral()[None], **other)[0] - as_assumed for other in unlogged])
     stage.raster_error = np.array([SIMPLER[machine.kind]])
     if others is not i:
         stage.hidden = hidden

@@ -127,7 +127,7 @@ def remade(stage: Stage, laws: Sequence[str], curves: Sequence[tuple[Placed, Eff
     assert isinstance(stage.made, Made)
     make, driven = stage.made
     out = make(driven._replace(laws=tuple(laws), curves=tuple(curves), again=True))
-    for name in ("floor", "quiet", "noise", "raster_error", "memory", "regimes", "regime_units", "grain"):
+    for name in ("floor", "quiet", "noise", "raster_error", "lost", "memory", "regimes", "regime_units", "grain"):
         setattr(out, name, getattr(stage, name))
     return out
 

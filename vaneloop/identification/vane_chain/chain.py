@@ -296,7 +296,7 @@ def _chain(
         of = {int(machine.p[r + C_OF, 0]) for r in curves}
         if lost := next((q.name for q in QUANTITIES.values() if q.of in of and q.name not in logged), None):
             raise LogError(f"{log.path}: has no {lost}, of which a learned law of the model is a function")
-    filled = machine.usual
+    filled, assumed = machine.usual, dict[str, float]()
     have = {**columns, **motion.columns()}
     for name in explained & columns.keys():
         there = _sampled(log.channels[name], t, grid, known[name])
@@ -309,6 +309,8 @@ def _chain(
             have[name] = np.full(len(t), value)
             if name in log.channels or (name == "p_s" and machine.kind != "hydraulic"):
                 continue  # no subsystem here takes it; a motor needs no oil
+            if doubt := machine.usual_within[name]:
+                assumed[name] = doubt / 3.0**0.5  # of a uniform interval of that half-width
             notes.append(
                 f"{name}: not logged; {value:g} {UNITS[name]} assumed, and effects that need it to change cannot be "
                 f"seen"
@@ -369,7 +371,7 @@ def _chain(
         have |= own.columns()
         # how much of the rotor speed's noise is an error of the demand, only a whole log tells
         told = name == "demand" and bool(pieces)
-        driven = Driven(t, dict(have), machine, cal, outputs, rows, present, turns=turns, again=told)
+        driven = Driven(t, dict(have), machine, cal, outputs, rows, present, turns=turns, assumed=assumed, again=told)
         make = make_of[name]
         stage = make(driven)
         stage.regimes, stage.regime_units = regimes, units

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +38,7 @@ class Driven(NamedTuple):
     laws                 effects of the library that may be tried; None: all that the stage can have
     curves               what may be tried besides: curves as they run, and as the search has them
     turns                what follows from the whole stroke (`ground.reversals`), worked out when it is asked for
+    assumed              channels that nobody logged: standard deviation of the value in their place, border units
     part_of              of an excerpt: the whole, and which of its rows these are
     again                whether the stage takes its noise over, as one does that was made of this log before: it is not
                          estimated
@@ -52,6 +54,7 @@ class Driven(NamedTuple):
     laws: tuple[str, ...] | None = None
     curves: tuple[tuple[Placed, Effect], ...] = ()
     turns: Callable[[], dict[str, Array]] = dict
+    assumed: Mapping[str, float] = MappingProxyType({})
     part_of: tuple[Driven, Array | slice] | None = None
     again: bool = False
 
