@@ -155,6 +155,7 @@ export default {
       this.build();
     },
     build() {
+      this.wide = this.width();
       this.dark = document.body.classList.contains("body--dark");
       if (this.$refs.hint) this.$refs.hint.style.display = this.head.panels.length ? "" : "none";
       this.plots.forEach((p) => p.destroy());
@@ -172,7 +173,7 @@ export default {
         const last = i === shown[shown.length - 1];
         const axis = { stroke: colour("soft"), grid: { stroke: colour("grid"), width: 1 }, ticks: { stroke: colour("grid"), width: 1 }, font: "12px system-ui, sans-serif" };
         const plot = new uPlot({
-          width: this.width(), height: panel.height + (last ? 34 : 12), padding: [8, 14, 0, 0],
+          width: this.wide, height: panel.height + (last ? 34 : 12), padding: [8, 14, 0, 0],
           legend: { show: false },
           cursor: { sync: { key: "vaneloop", scales: ["x", null] }, drag: { x: true, y: false, setScale: false }, focus: { prox: 24 }, points: { size: 6 } },
           scales: { x: { time: false }, y: { range: (u, low, high) => this.range(low, high, panel) } },

@@ -10,16 +10,20 @@ export default {
   mounted() {
     this.plot = this.$refs.plot;
     this.lines = [...(this.options.layout.shapes || [])];  // Plotly writes into what it is given
-    Plotly.newPlot(this.plot, this.options.data, this.options.layout, this.options.config);
+    // a width that is set while a figure is being drawn is lost: one after the other
+    this.drawn = Plotly.newPlot(this.plot, this.options.data, this.options.layout, this.options.config);
     this.plot.on("plotly_click", (e) => this.go(e.points[0].customdata));
-    this.sizes = new ResizeObserver(() => {
-      const w = this.$el.clientWidth;
-      if (w > 0 && w !== this.wide && this.$el.isConnected) { this.wide = w; Plotly.relayout(this.plot, { width: w }); }
-    });
+    this.sizes = new ResizeObserver(() => { this.drawn = this.drawn.then(() => this.fit()); });
     this.sizes.observe(this.$el);
   },
   unmounted() { this.sizes.disconnect(); Plotly.purge(this.plot); },
   methods: {
+    fit() {
+      const w = this.$el.clientWidth;
+      if (w <= 0 || w === this.wide || !this.$el.isConnected) return;
+      this.wide = w;
+      return Plotly.relayout(this.plot, { width: w });
+    },
     go(t) { if (typeof t === "number") this.$emit("cell", t); },
     key_(e) {
       const by = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [1, 0], ArrowDown: [-1, 0] }[e.key], m = this.map;
