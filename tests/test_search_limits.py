@@ -275,7 +275,7 @@ def test_a_stage_of_sixty_thousand_samples_is_searched_on_forty_thousand_in_piec
     assert (settings.LONG_SAMPLES, settings.EXCERPT_SAMPLES, settings.EXCERPT_PIECE) == (60_000, 40_000, 4_000)
     seen = []
     monkeypatch.setattr(
-        diagnose, "_to_the_floor", lambda stage, *_: seen.append(len(stage.t)) or SimpleNamespace(verdict="unknown")
+        diagnose, "_whenever", lambda stage, *_: seen.append(len(stage.t)) or SimpleNamespace(verdict="unknown")
     )
     nothing = SimpleNamespace(theta=np.zeros(1))
     monkeypatch.setattr(diagnose, "_confirm", lambda *_: SimpleNamespace(verdict="none", final=nothing))

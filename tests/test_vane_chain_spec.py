@@ -610,7 +610,8 @@ def test_the_nominal_machine_has_every_stage_at_its_noise(chain: Chain) -> None:
         assert np.all(rms(s, e) < 1.6 * s.floor), s.name
         assert np.isfinite(s.measured).mean() > 0.6 and not np.isfinite(s.measured[:, :300]).any()  # it settles first
         assert (s.window == 1.0) == (s.name in ("servo", "actuator"))
-        assert {p.name for p in s.parameters} <= set(FREE[s.name])
+        *own, onset = s.parameters
+        assert {p.name for p in own} <= set(FREE[s.name]) and (onset.name, onset.limits()) == ("onset", (0.0, 0.0))
     assert chain.stage("linkage").outputs == tuple(v for v in VANES if v in chain.plant.vanes)
 
 
@@ -1539,7 +1540,7 @@ def test_a_curve_in_the_servo_changes_its_current_by_its_value(chain: Chain) -> 
         law = curve_effect("law", learned("servo.current", how, of, 0.0, 100.0, 0.1, 0.1, 0.1, 0.1))
         with_it = remade(stage, ("controller_gain_error",), [law])
         thetas = np.array([with_it.neutral()] * 3)
-        thetas[1, -1], thetas[2, 0] = 3.0, 2.0
+        thetas[1, -1], thetas[2, with_it.index()["controller_gain_error"]] = 3.0, 2.0
         still, by, twice = with_it.run(thetas)[:, 0]
         assert by == pytest.approx(still + 0.3 if how == "adds" else 1.3 * still)
         assert twice == pytest.approx(2.0 * still)

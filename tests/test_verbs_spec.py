@@ -19,6 +19,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.spans import Span
 from vaneloop.identification import Record, StageError, System
 from vaneloop.identification.chunked_residuals import Failing, Sums
+from vaneloop.identification.onset import Onset
 from vaneloop.identification.settings import PIECE_BLOCKS
 from vaneloop.identification.subsystem import Effect, Parameter, Stage
 from vaneloop.identification.unmodelled.fitted_candidate import Outcome
@@ -833,14 +834,17 @@ def test_a_diagnosis_notes_what_the_log_said_what_fails_and_what_is_at_its_limit
 ) -> None:
     asked: list[Any] = []
     row = {"parameter": "k", "value": 1.0, "unit": "mm", "at_limit": True}
-    found = SimpleNamespace(stages=[SimpleNamespace(stage="a", recalibrated=[row])], notes=["old"])
+    stages = [SimpleNamespace(stage="a", recalibrated=[row], onset=Onset(2.0, 1.5, 3.0))]
+    stages.append(SimpleNamespace(stage="b", recalibrated=[], onset=None))
+    found = SimpleNamespace(stages=stages, notes=["old"])
     monkeypatch.setattr(search, "search", lambda *a, **how: asked.append((a, how)) or found)
     limit = "a: k stands at the end of its tolerance, 1 mm: the log would have it go on"
-    chain: Any = SimpleNamespace(whole=None, stages=["s"], not_observed={"b": "x"}, notes=["n"])
+    chain: Any = SimpleNamespace(whole=None, stages=["s"], not_observed={"b": "x"}, notes=["n"], start=100.0)
     tell: Any = object()
     said = search.diagnosed(chain, "a.csv", 3, tell, tell)
     assert asked == [((["s"], {"b": "x"}, tell, 3), {"news": tell})] and said.held is None and said.bound is chain
     assert said.diagnosis.notes == ["n", limit] and said.log == "a.csv"
+    assert stages[0].onset == Onset(102.0, 101.5, 103.0) and stages[1].onset is None  # in the log's own time
     chain.whole = "whole"
     monkeypatch.setattr(search, "searched", lambda *a: asked.append(a) or (chain, found, HELD))
     said = search.diagnosed(chain, "a.csv", 3, tell, tell)
@@ -1171,7 +1175,8 @@ def extending(monkeypatch: pytest.MonkeyPatch) -> Any:
     """A chain of two stages, and what is fitted in them."""
     asked: list[Any] = []
     monkeypatch.setattr(search, "extend_stage", lambda stage, names, **how: SimpleNamespace(
-        stage=stage.name, recalibrated=[], names=names, on=stage, effects=[
+        stage=stage.name, recalibrated=[], names=names, on=stage,
+        onset=Onset(5.0, 4.0, 6.0) if "valve_null_bias" in names else None, effects=[
             SimpleNamespace(effect=n, parameters={"scale": {"value": 1.0}}, fall=1.0 + (stage.name == "linkage"))
             for n in names
         ]))  # fmt: skip
@@ -1189,6 +1194,7 @@ def extending(monkeypatch: pytest.MonkeyPatch) -> Any:
         notes: Any = ("n",)
         whole: Any = None
         plant: Any = field(default_factory=lambda: SimpleNamespace(kind="hydraulic"))
+        start: float = 10.0
 
         def stage(self, name: str) -> Any:
             return next(s for s in self.stages if s.name == name)
@@ -1213,6 +1219,9 @@ def test_effects_are_fitted_in_the_stage_that_shows_them_most_clearly(monkeypatc
     monkeypatch.setattr(search, "held_results", lambda bound, results: (results, HELD))
     said = search.extended(chain, ["valve_lag"], Model(), "a.csv")
     assert said.held is HELD and said.diagnosis.notes == ["n", str(HELD.failing[0])]
+    said = search.extended(chain, ["valve_null_bias"], Model(), "a.csv")
+    told = "actuator: effects from 15.0 s on [14.0, 16.0]; the model has them all along"
+    assert said.diagnosis.notes[-1] == told and said.diagnosis.stages[0].onset == Onset(15.0, 14.0, 16.0)
 
 
 def test_what_the_log_does_not_show_cannot_be_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
