@@ -179,6 +179,7 @@ def test_a_controller_that_crashes_is_a_failed_machine_and_not_the_end(tmp_path:
     ours, theirs = view.groups
     assert (ours.failed, theirs.failed) == (0, 4) and view.passed(ours) and not view.passed(theirs)
     assert theirs.same and "--controller" in theirs.command and "abort" in theirs.seen[0]
+    assert len(theirs.failures) == 4 and theirs.reproduces and "--controller" in theirs.failures[0].command
 
 
 @pytest.mark.slow
