@@ -610,6 +610,25 @@ def test_a_campaign_says_a_small_probability_by_its_levels(
     assert view.json()["groups"][0]["rare"]["levels"][0] == {"margin": 0.3, "share": 0.1, "variation": 0.2}
 
 
+@pytest.mark.parametrize(
+    ("sampling", "fails", "said"),
+    [("subset", 30, "30 of 250 samples fail"), ("subset", 2, "the levels have no answer"), ("random", 2, "")],
+)
+def test_a_probability_that_is_counted_where_levels_were_asked_for_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sampling: str, fails: int, said: str
+) -> None:
+    plan, quantities, run = begun(
+        tmp_path, monkeypatch, f'samples = 250\nsearch = 0\nsaved = 0\nsampling = "{sampling}"'
+    )
+    limit = sorted(draw(plan, 2)[0][:, 0])[fails]
+    samples = sampled(plan, lambda u: u[0] - limit)
+    monkeypatch.setattr(campaign, "_rows", lambda folder, g, of="[0-9]*.json": samples if of[0] == "[" else {})
+    monkeypatch.setattr(campaign, "trial_once", lambda *of: samples["000000"])
+    (g,) = campaign.judge(plan, quantities, run, lambda share: None).groups
+    assert g.counted == said and g.rare is None and g.probability == fails / 250
+    assert (g.low, g.high) == campaign.interval(fails, 250, 0.95)
+
+
 # ---- probability and requirements ------------------------------------------------------------------------------------
 
 

@@ -709,7 +709,8 @@ def test_a_campaign_that_is_broken() -> None:
               seen=["at 3 s: fault", "at 4 s: abort"], first=[], total=[],
               failures=[FailedMachine(f"00000{k}", -0.2, f"out/failed/00000{k}.toml", "vaneloop inject", k == 1)
                         for k in (1, 2)]),
-        group("stop.soft.mine", by_search=False, same=False, total=[0.2, 1.2]),
+        group("stop.soft.mine", by_search=False, same=False, total=[0.2, 1.2],
+              counted="30 of 64 samples fail"),
         group("rare.soft.mine", by_search=False, low=1e-5, high=1e-3,
               rare=Rare(1.2e-4, 1e-5, 1e-3, 900, [{"margin": 0.1, "share": 0.1, "variation": 0.2},
                                                   {"margin": 0.0, "share": 0.0012, "variation": 0.3}], True)),

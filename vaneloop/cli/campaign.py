@@ -127,6 +127,8 @@ def _show(args: argparse.Namespace, view: CampaignView, search: int) -> None:
             terminal.say(args, f"without an answer: {g.lost} trials of {g.name}; vaneloop fleet status says what came")
         if g.rare:
             terminal.say(args, f"{g.name}: {g.rare.text}")
+        if g.counted:
+            terminal.say(args, f"{g.name}: the failure probability is counted: {g.counted}")
         if search and not g.runs:
             terminal.say(args, f"no search in {g.name}: too few of its trials have an answer")
         terminal.say(args, f"worst case: {g.command}")

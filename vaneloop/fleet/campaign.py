@@ -85,7 +85,7 @@ def take_searches(plan: Plan, folder: Folder) -> int:
         rows = [row for row in _rows(folder, g).values() if row is not None]
         among = moving(rows)
         known = [(row["point"], worst_share(row, among)) for row in rows]
-        if plan.sampling == "subset" and sum(share < 0.0 for _, share in known) < SHARE * len(known):
+        if plan.sampling == "subset" and _are_rare(sum(not row["held"] for row in rows), len(rows)):
             trials.append(_trial(folder, g, "subset", {"subset": True, "among": among, "known": known}))
         if plan.search and len(known) >= plans.LEAST:
             known.sort(key=lambda k: (k[1], k[0]))
@@ -158,13 +158,22 @@ def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[
             g.name, g.scenario, g.calibration, g.firmware, len(done), len(rows) - len(done), failed, low, high,
             _requirements(done, nearest), shares, points, plans.values_at(quantities, worst["point"]), least, by_search,
             runs, worst["seen"], worst["state_hash"], str(saved), command, same and agreed, first, total, alone,
-            failures, rare,
+            failures, rare, "" if rare or plan.sampling != "subset" else _why_counted(failed, len(done)),
         ))  # fmt: skip
         told((k + 1) / len(all_groups))
     return CampaignView(
         plan.title, str(folder.path), folder.job["version"], [vars(q) for q in quantities], plan.confidence,
         plan.allowed, plan.sampling, plan.seed, shown,
     )  # fmt: skip
+
+
+def _are_rare(failed: int, n: int) -> bool:
+    """Whether so few of the samples fail that levels beyond them are asked for."""
+    return failed < SHARE * n
+
+
+def _why_counted(failed: int, n: int) -> str:
+    return "the levels have no answer" if _are_rare(failed, n) else f"{failed} of {n} samples fail"
 
 
 def _rare(levels: dict[str, Any] | None, confidence: float, worst: bool) -> Rare | None:

@@ -96,6 +96,7 @@ class GroupView:
     alone                  samples that ran on the lockstep bus and not in lanes, by the reason
     failures               failed samples that are saved, the worst first
     rare                   the probability by subset simulation; None: it is counted
+    counted                why it is counted where the plan asks for a subset simulation; empty: it does not, or it came
     """
 
     name: str
@@ -124,6 +125,7 @@ class GroupView:
     alone: dict[str, int] = field(default_factory=dict)
     failures: list[FailedMachine] = field(default_factory=list)
     rare: Rare | None = None
+    counted: str = ""
 
     @property
     def probability(self) -> float:
@@ -247,6 +249,8 @@ def _group(page: Page, view: CampaignView, g: GroupView) -> None:
             ["level", "least margin at or below", "share", "coefficient of variation"],
             [[k, of["margin"], of["share"], of["variation"]] for k, of in enumerate(g.rare.levels, 1)],
         )
+    if g.counted:
+        page.text(f"The failure probability is counted: {g.counted}.")
     names = [q["name"] for q in view.varied]
     if g.total:
         total, first = np.round(g.total, 3).tolist(), np.round(g.first, 3).tolist()
