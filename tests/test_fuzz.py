@@ -115,10 +115,17 @@ def test_no_index_is_out_of_bounds_and_compiled_code_does_what_the_source_says()
 TIGHT = np.array([0.040, 0.0, 0.030])  # A, m, m: the controller is allowed 0.0475 m
 
 
-def test_a_failure_is_shrunk_written_and_replays(tmp_path: Path) -> None:
-    campaign = fuzz.fuzz(200_000, seed=1, limits=TIGHT)
-    f = campaign.failure
-    assert f is not None and f.claim == "the stroke demand left its limits"
+@pytest.fixture(scope="module")
+def failure() -> fuzz.Failure:
+    """What a campaign with limits that are too tight finds first, shrunk."""
+    found = fuzz.fuzz(200_000, seed=1, limits=TIGHT).failure
+    assert found is not None
+    return found
+
+
+def test_a_failure_is_shrunk_written_and_replays(failure: fuzz.Failure, tmp_path: Path) -> None:
+    f = failure
+    assert f.claim == "the stroke demand left its limits"
     whole = make_attack(np.random.default_rng([1, f.episode]))[0]
     assert 1 <= len(f.attack.at) < len(whole.at) / 10
     log = tmp_path / "failure.log"
@@ -128,9 +135,8 @@ def test_a_failure_is_shrunk_written_and_replays(tmp_path: Path) -> None:
     assert run_attack(read_attack(log))[0] == "held"
 
 
-def test_no_frame_can_be_left_out_of_a_shrunk_failure() -> None:
-    f = fuzz.fuzz(200_000, seed=1, limits=TIGHT).failure
-    assert f is not None
+def test_no_frame_can_be_left_out_of_a_shrunk_failure(failure: fuzz.Failure) -> None:
+    f = failure
     assert 1 <= len(f.attack.at) < 10
     for k in range(len(f.attack.at)):
         at, rows = np.delete(f.attack.at, k), np.delete(f.attack.rows, k, axis=0)
