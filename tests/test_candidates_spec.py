@@ -88,6 +88,7 @@ def test_a_formula_in_words(name: str, numbers: list[float], above: bool, mean: 
     assert text_of(form, np.array(numbers), "speed", above, mean) == text
     q = np.linspace(1.0, 2.0, 5)
     formula = Formula(name, text, dict(zip(form.numbers, numbers, strict=True)), 1.0, 2)
+    assert formula.level == 0.0 and text_of(form, np.array(numbers), "speed", above) == re.sub(r" [-+] 3$", "", text)
     assert values_of(formula, q) == pytest.approx(form.value(q, np.array(numbers)))
     assert values_of(Formula("constant", "", {"a": 3.0}, 1.0, 1), q).tolist() == [3.0] * 5
 
@@ -153,7 +154,7 @@ def test_what_repeats_itself_has_sines_and_cosines(harmonics: int, period: float
         assert f[:, 2 * k - 1] == pytest.approx(np.sqrt(2.0) * np.sin(turns), abs=0.03)
         assert f[:, 2 * k] == pytest.approx(np.sqrt(2.0) * np.cos(turns), abs=0.03)
         assert b.bend[2 * k - 1] == b.bend[2 * k] == k**4
-    assert f.shape[1] == 2 * harmonics + 1
+    assert f.shape[1] == 2 * harmonics + 1 and len(b.turn) == 9 * harmonics  # docs/settings.md
 
 
 def test_too_few_values_are_no_curve_and_two_or_three_make_a_straight_one() -> None:
@@ -209,6 +210,9 @@ def test_a_curve_has_as_many_splines_as_it_is_to_have_with_knots_at_quantiles(co
     assert len(inner) == len(wanted) == count - 4 and inner == pytest.approx(wanted, abs=0.02)
     assert b.low == 0.0 and b.high == 1.0
     assert basis_of(3.0 + 1e-13 * x) is None and basis_of(-3.0 - 1e-9 * x) is not None  # as rounding may leave them
+    crowd = np.concatenate([1e-4 * np.random.default_rng(1).random(500), np.linspace(0.0, 1.0, 60)])
+    ends = basis_of(crowd, count)
+    assert ends is None or [np.count_nonzero(ends.knots == end) for end in (ends.low, ends.high)] == [4, 4]
     wave = waves_of(1.0, 2)
     fine = np.linspace(0.0, 1.0, 999)
     off = functions(wave, fine)[:, 3] - np.sqrt(2.0) * np.sin(4.0 * np.pi * fine)
@@ -254,7 +258,9 @@ def test_fits_start_from_hardly_seen_to_gross_and_both_ways_where_a_law_may_go()
                     continue
                 up = values[values > 0.0]
                 assert up.max() / up.min() >= (5.0 if p.high == 1.0 else 9.0), told  # from hardly seen to gross
-                assert np.all(up[1:] / up[:-1] <= 8.0), told  # and none far from the next
+                assert np.all(up[1:] / up[:-1] <= (10.0 if place == "state" else 5.0) + 1e-9), (
+                    told
+                )  # none far from the next
                 assert p.high >= 1.2 * up.max() or p.high == up.max() == 1.0, told
             if name == "bouc_wen":
                 assert set(sizes[:, 2]) == {ps[2].value} == {1.0}
@@ -277,6 +283,13 @@ def test_fits_start_from_hardly_seen_to_gross_and_both_ways_where_a_law_may_go()
     levels = [s[0] for s in LAWS["state"]["overflow"].make(USUAL)[1]]
     assert levels == sorted(levels, reverse=True) and (levels[0], levels[-1]) == (USUAL.high, 0.5)
     assert share.value == 1.0 and share.low + share.high == 2.0 and level.value == level.high
+    held, step = 0.1, 0.01  # halfway from the last sample of one hold to that of two
+    stopped = LAWS["signal"]["stiction"].constant
+    assert stopped is not None
+    assert stopped(replace(USUAL, held=held)) == pytest.approx(0.5 * ((held - step) + (2.0 * held - step)))
+    assert stopped(USUAL) == 0.5 * step  # at once, where a command changes with every sample
+    down = replace(USUAL, low=-9.0)
+    assert (USUAL.greatest, down.greatest, replace(USUAL, low=3.0).half) == (5.0, 9.0, 1.0)
     low, high = LAWS["signal"]["saturation"].make(USUAL)[0]
     assert (low.value, high.value) == (-13.0, 14.0)  # a range beyond either end: it changes nothing
 

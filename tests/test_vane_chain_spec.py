@@ -984,6 +984,14 @@ def test_a_curve_at_a_shared_place_is_judged_in_the_other_subsystem(chain: Chain
     assert source.elsewhere([law], theta)[said[0]] == pytest.approx(said[1] + np.log(2.0), abs=0.2)
     at_valve = curve_effect("law", learned("valve.current", "adds", "x_lvdt", 2.0, 40.0, -2.0, 1.0, -1.0, 2.0))
     assert source.elsewhere([at_valve], theta) == {}
+    of_demand = curve_effect("law", learned("sensors.lvdt", "adds", "n_dem", 0.0, 100.0, -2.0, 1.0, -1.0, 2.0))
+    (linkage,) = (s for s in source.others if s.name == "linkage")
+    assert list(source.elsewhere([of_demand], theta)) == ["the linkage subsystem"]
+    driven, make = driven_of(linkage), linkage.made.make  # type: ignore[attr-defined]
+    blind = make(driven._replace(columns={k: v for k, v in driven.columns.items() if k != "n_dem"}))
+    blind.floor = linkage.floor
+    source.others = [blind]
+    assert source.elsewhere([of_demand], theta) == {}  # nothing is known of it there
 
 
 # ---- what subsystems make of a log
@@ -1476,6 +1484,17 @@ def test_a_hysteresis_slips_by_the_whole_course_of_what_moves_it(chain: Chain) -
     part = with_laws_of.at(at, {k: v[at] for k, v in driven.columns.items()}, driven.run[at])
     assert part.slipping(part.signals(), p)[KNOWN:] == pytest.approx(given[KNOWN:, at])
     assert driven.slipping(signals, driven.machine.p) is signals
+    more = curve_effect("more", learned("linkage.ring", "adds", "stops_of_x_lvdt", 0.0, 10.0, 0.0, 0.8, 1.2, 1.4))
+    both = remade(chain.stage("linkage"), (), [law, more])
+    sets = np.array([both.neutral()] * 2)
+    sets[1, -2:] = 1.0, 1.0
+    driven_by_both = driven_of(both)
+    p = lanes(driven_by_both, sets, np.zeros(0, dtype=int), np.zeros(0))
+    of_both = driven_by_both.slipping(driven_by_both.signals(), p)
+    assert len(of_both) == KNOWN + 4 and not of_both[KNOWN : KNOWN + 2].any()
+    assert of_both[KNOWN + 2] == pytest.approx(given[KNOWN + 1]) and of_both[KNOWN + 3] == pytest.approx(
+        2.0 * of_both[KNOWN + 2]
+    )
     still, one, two = stage.run(thetas)[:, 0]
     assert np.abs(two - one - (one - still)).max() < 0.2 * np.abs(one - still).max() and np.ptp(one - still) > 0.1
 
@@ -1544,6 +1563,11 @@ def test_a_curve_in_the_servo_changes_its_current_by_its_value(chain: Chain) -> 
         still, by, twice = with_it.run(thetas)[:, 0]
         assert by == pytest.approx(still + 0.3 if how == "adds" else 1.3 * still)
         assert twice == pytest.approx(2.0 * still)
+    # of the current that the law itself gives, which has no noise: a hundredth of it
+    line = curve_effect("law", learned("servo.current", "adds", "i_cmd", -60.0, 60.0, -0.6, -0.2, 0.2, 0.6))
+    with_it = remade(stage, (), [line])
+    still, by = with_it.run(np.array([[0.0], [5.0]]))[:, 0]
+    assert by == pytest.approx(1.05 * still, abs=1e-3) and np.abs(still).max() < 60.0
     law = curve_effect("law", learned("controller.demand", "adds", "n_r", 0.0, 100.0, 0.1, 0.1, 0.1, 0.1))
     demand = remade(chain.stage("demand"), (), [law])
     thetas = np.array([demand.neutral()] * 2)
@@ -1590,3 +1614,23 @@ def test_rivals_are_judged_with_the_other_effects_of_their_subsystem(monkeypatch
         ("actuator", "lvdt_bias", "valve_lag", (), machine),
         ("actuator", "a", "valve_lag", ("lvdt_bias",), machine),
     ]  # fmt: skip
+
+
+def test_a_current_of_single_ticks_is_made_the_mean_of_its_ticks(machine_log: Log, chain: Chain) -> None:
+    own = driven_of(chain.stage("servo")).columns
+    sampled = chain_of(with_(machine_log, i_cmd=own["ticks"][:, -1]))
+    assert list(sampled.notes) == [
+        "i_cmd: the current at single ticks, not the mean of those since the row before, which is worked out from "
+        "stroke and demand"
+    ]
+    c = driven_of(sampled.stage("servo")).columns
+    run = slice(400, None)
+    off = (c["i_cmd"] - own["i_cmd"])[run]
+    assert np.std(off) < 0.5 * np.std((own["ticks"][:, -1] - own["i_cmd"])[run])
+    assert np.array_equal(sampled.columns["i_cmd"], c["i_cmd"])
+    # the tick at the row has the logged stroke, with its noise: what is not known of it changes slowly
+    quick, quick_of_mean = (np.std(np.diff(of["law_error"], axis=0)) for of in (c, own))
+    assert quick < 0.5 * quick_of_mean
+    unknown = (c["other_ticks"].mean(axis=1) - c["i_cmd"])[run]
+    as_was = (own["other_ticks"].mean(axis=1) - own["i_cmd"])[run]
+    assert np.std(as_was) < 1e-9 < np.std(unknown)

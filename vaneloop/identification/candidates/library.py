@@ -57,7 +57,7 @@ class Size:
     @property
     def greatest(self) -> float:
         """Largest magnitude."""
-        return max(abs(self.low), abs(self.high), 1e-300)
+        return max(-self.low, self.high, 1e-300)
 
 
 @dataclass(frozen=True)
@@ -92,12 +92,12 @@ def _one(name: str, unit: str, neutral: float, low: float, high: float, starts: 
     return (Parameter(name, neutral, unit, low, high),), tuple((float(v),) for v in starts)
 
 
-def _both(size: float, parts: tuple[float, ...] = TRIED_SIZES) -> list[float]:
+def _both(size: float, parts: tuple[float, ...] = (0.02, 0.1, 0.5)) -> list[float]:
     return [sign * part * size for part in parts for sign in (1.0, -1.0)]
 
 
 def _bias(z: Size) -> _Made:
-    return _one("offset", z.unit, 0.0, -2.0 * z.greatest, 2.0 * z.greatest, _both(z.greatest))
+    return _one("offset", z.unit, 0.0, -2.0 * z.greatest, 2.0 * z.greatest, _both(z.greatest, TRIED_SIZES))
 
 
 def _gain(z: Size) -> _Made:
@@ -225,7 +225,7 @@ def _force_offset(z: Size) -> _Made:
 def _viscous(z: Size) -> _Made:
     c = z.force / z.speed
     return _one(
-        "coefficient", f"({z.force_unit})/({z.speed_unit})", 0.0, 0.0, 20.0 * c, [part * c for part in (0.02, 0.1, 0.5)]
+        "coefficient", f"({z.force_unit})/({z.speed_unit})", 0.0, 0.0, 20.0 * c, [v for v in _both(c) if v > 0.0]
     )
 
 
@@ -246,16 +246,12 @@ def _stribeck(z: Size) -> _Made:
 
 def _quadratic_drag(z: Size) -> _Made:
     c = z.force / z.speed**2
-    return _one(
-        "coefficient", f"({z.force_unit})/({z.speed_unit})^2", 0.0, -20.0 * c, 20.0 * c, _both(c, (0.02, 0.1, 0.5))
-    )
+    return _one("coefficient", f"({z.force_unit})/({z.speed_unit})^2", 0.0, -20.0 * c, 20.0 * c, _both(c))
 
 
 def _spring(z: Size) -> _Made:
     k = z.force / z.travel
-    return _one(
-        "stiffness", f"({z.force_unit})/({z.travel_unit})", 0.0, -20.0 * k, 100.0 * k, _both(k, (0.02, 0.1, 0.5))
-    )
+    return _one("stiffness", f"({z.force_unit})/({z.travel_unit})", 0.0, -20.0 * k, 100.0 * k, _both(k))
 
 
 def _cubic_spring(z: Size) -> _Made:
@@ -298,7 +294,7 @@ def _friction_asymmetry(z: Size) -> _Made:
 
 
 def _state_offset(z: Size) -> _Made:
-    return _one("rate", f"({z.unit})/s", 0.0, -10.0 * z.rate, 10.0 * z.rate, _both(z.rate, (0.02, 0.1, 0.5)))
+    return _one("rate", f"({z.unit})/s", 0.0, -10.0 * z.rate, 10.0 * z.rate, _both(z.rate))
 
 
 def _power(z: Size, n: float, unit: str, signs: bool = True) -> _Made:

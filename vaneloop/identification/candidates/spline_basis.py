@@ -121,7 +121,7 @@ def basis_of(visited: Array, count: int = CURVE_SPLINES) -> Basis | None:
     if len(few := np.unique(x)) in (2, 3):
         return _straight(x, float(few[0]), float(few[-1]))
     low, high = (float(np.quantile(x, q)) for q in (EDGE_SHARE, 1.0 - EDGE_SHARE))
-    if not high - low > 1e-12 * max(abs(low), abs(high), 1e-300):
+    if not high - low > 1e-12 * max(-low, high, 1e-300):
         return None
     apart = STRAY_RANGE * (high - low)
     low, high = max(low - apart, float(x[0])), min(high + apart, float(x[-1]))
