@@ -1498,8 +1498,8 @@ def test_a_frequency_is_found_from_short_windows_where_a_free_run_loses_its_phas
     assert bound.runner.steps in (2, 4, 8, 16) and bound.data.window is None
 
 
-@pytest.mark.parametrize("c", [0.5, 12.0])
-def test_an_integration_takes_as_many_steps_as_its_rate_needs(c: float) -> None:
+def test_an_integration_takes_as_many_steps_as_its_rate_needs() -> None:
+    c = 12.0
     system = System(
         "lag", "simulate", decay, {"y": "V"}, {"u": "V"}, [Parameter("c", c, "1/s")], states={"y": "V"},
         start={"y": 0.7}, places=["u"],
@@ -1508,7 +1508,7 @@ def test_an_integration_takes_as_many_steps_as_its_rate_needs(c: float) -> None:
     bound = BoundSystem(system, [log])
     y = bound.run(bound.stage.neutral()[None])[0, 0]
     assert y == pytest.approx(log.columns["y"], abs=3e-3 * np.std(log.columns["y"]))
-    assert bound.runner.steps == {0.5: 1, 12.0: 2}[c]
+    assert bound.runner.steps == 2
 
 
 def test_springs_that_carry_a_force_at_the_start_are_said() -> None:
@@ -1724,8 +1724,7 @@ def test_a_state_that_nobody_measures_goes_as_the_nominal_model_has_it() -> None
 
 
 @pytest.mark.parametrize(
-    ("how", "of", "value"), [("output adds", "y", 0.3), ("output adds", "u", 0.2), ("output times", "time", 0.4),
-                             ("output adds", "w", 0.2), ("output times", "y", 0.1)],
+    ("how", "of", "value"), [("output adds", "y", 0.3), ("output adds", "u", 0.2), ("output times", "w", 0.2)],
 )  # fmt: skip
 def test_a_state_starts_where_its_sensor_with_its_curve_reads_what_was_read(how: str, of: str, value: float) -> None:
     log = driven_decay(1, 0.7, 8.0)
