@@ -79,14 +79,17 @@ def that_begins(make: Callable[[Driven], Stage]) -> Callable[[Driven], Stage]:
 def _begin(stage: Stage, out: Array, before: Array, onset: float) -> None:
     """Let ``out`` be ``before`` until the onset; each float64[outputs, samples].
 
-    A stage that integrates goes on from where it stood: to the end of the window that the onset lies in, its output is
-    moved by what the effects would have made of the window's beginning.
+    The window of a stage that integrates ends at the onset, and another begins: where a reading jumps and where it goes
+    on is free. Both parts get the same mean error, which is then taken off as the window's constant.
     """
     k = int(np.searchsorted(stage.t, onset))
     if stage.window and k < len(stage.t):
         number = np.floor((stage.t[k] - stage.t[0]) / stage.window + 1e-9)
-        end = int(np.searchsorted(stage.t, stage.t[0] + (number + 1.0) * stage.window - 1e-9))
-        out[:, k:end] += (before[:, k] - out[:, k])[:, None]
+        first, end = np.searchsorted(stage.t, stage.t[0] + (number + np.arange(2)) * stage.window - 1e-9)
+        for m, x, y in zip(stage.measured, out, before, strict=True):
+            behind, ahead = (e[np.isfinite(e)] for e in (m[first:k] - y[first:k], m[k:end] - x[k:end]))
+            if len(behind) and len(ahead):
+                x[k:end] += ahead.mean() - behind.mean()
     out[:, :k] = before[:, :k]
 
 

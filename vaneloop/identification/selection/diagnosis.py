@@ -206,12 +206,15 @@ def _whenever(
     for _ in range(ONSET_ROUNDS):
         if at is None:
             break
-        found = ask(begun(stage, at))
-        if not found.final.effects:
-            break
-        judge = LeastSquaresProblem(stage, found.floor, keep)
-        correlation = correlation_of(judge, found.final)
-        fit, when = found.final, change_point(judge, found.final, correlation)
+        later = begun(stage, at)
+        found = ask(later)
+        fit, judge = found.final, LeastSquaresProblem(stage, found.floor, keep)
+        if not fit.effects:  # a block is too coarse for an answer: the time follows from what comes nearest to one
+            if not found.nearest:
+                break
+            fit = LeastSquaresProblem(later, found.floor, keep).fit(tuple(found.nearest[:1]), later.neutral())
+        correlation = correlation_of(judge, fit)
+        when = change_point(judge, fit, correlation)
         settled = when.low < at <= when.high
         for _ in range(0 if settled else ONSET_ROUNDS):
             if when.value == at:
