@@ -20,7 +20,7 @@ from vaneloop.identification.least_squares.noise import correlation_of, floor_de
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, covariance, recalibrate
 from vaneloop.identification.least_squares.residuals import ResidualCache
 from vaneloop.identification.results import at_bound, estimates, parameters_of, recalibrated, rms_of, rms_per_output
-from vaneloop.identification.subsystem import Array, noise_of, reach_of, size_of, without_jumps
+from vaneloop.identification.subsystem import Array, lifted, noise_of, reach_of, size_of, without_jumps
 
 # docs/settings.md
 AGREES, SPREADS, COLOUR, NINETY, EVIDENCE, DIFFERENCE, NO_ANSWER_ERROR = 1.1, 3.0, (2.0, 5.0), 1.645, 200.0, 1e-3, 1e6
@@ -499,3 +499,9 @@ def test_a_stage_that_does_not_go_together_is_refused(change: dict[str, Any], sa
     stage, _ = made(12)
     with pytest.raises(StageError, match=says):
         replace(stage, **change)
+
+
+def test_an_error_that_lifts_a_floor_by_less_than_that_is_known_to_is_none() -> None:
+    floor = np.array([0.03, 0.008])
+    assert lifted(floor, 2e-3) == pytest.approx([0.03, np.hypot(0.008, 2e-3)], rel=1e-12)
+    assert lifted(floor, 2e-3)[0] == floor[0]

@@ -28,6 +28,7 @@ from vaneloop.identification.selection.diagnosis import diagnose_stage, extend_s
 from vaneloop.identification.vane_chain import current
 from vaneloop.identification.vane_chain import current as stroke
 from vaneloop.identification.vane_chain.chain import Chain, _lost_bits, _lost_step, build_chain
+from vaneloop.identification.vane_chain.low_pass import AS_LOGGED
 from vaneloop.identification.vane_chain.resample import rms
 from vaneloop.identification.workflow import compare_stages, locate_stages
 
@@ -302,7 +303,7 @@ def test_the_servo_s_law_is_the_firmware_s_loop_tick_by_tick() -> None:
     rate = np.diff(now, prepend=demand[0]) / 1e-3
     e = now - seen.ravel()
     out = np.empty((30, 10))
-    current._loop(*current._demanded(demand, current.LowPass()), seen, kp, ki, kff, out)
+    current._loop(*current._demanded(demand, AS_LOGGED), seen, kp, ki, kff, out)
     assert np.allclose(out.ravel(), kp * e + ki * 1e-3 * np.cumsum(e) + kff * rate)
 
 

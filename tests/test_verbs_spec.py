@@ -211,6 +211,7 @@ class Stages:
     whole: Any = None
     stages: Any = ()
     test: Any = None
+    late: Any = None
 
 
 def whole_of(pieces: float, channels: dict[str, Channel] | None = None, chosen: Sequence[int] = ()) -> Whole:
@@ -289,12 +290,13 @@ def test_pieces_are_added_until_every_visited_bin_is_in() -> None:
 def test_an_excerpt_has_half_its_pieces_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
     monkeypatch.setattr(long, "spread", lambda pieces, many, _: asked.append((pieces, many)) or [0])
-    stages_of: Any = lambda log, grid, rows: Stages(rows)  # noqa: E731
+    stages_of: Any = lambda log, grid, rows, late=None: Stages(rows, late=late or {"engine": "late"})  # noqa: E731
     whole = whole_of(9, at_levels([0.0] * 9))
     for fitted, many in ((3000, 5), (600, 2), (0, 2), (3599, 5)):
         chain: Any = long.excerpted(whole.log, whole.grid, stages_of, fitted)
         assert asked.pop() == (9, many) and chain.rows == [(0, 600)] and chain.whole.chosen == (0,)
-    long.excerpted(whole.log, whole.grid, stages_of)
+    chain = long.excerpted(whole.log, whole.grid, stages_of)
+    assert chain.whole.bind.keywords == {"late": chain.late} and chain.late == {"engine": "late"}  # not found anew
     assert asked == [(9, 200)]  # of 120,000 rows
 
 

@@ -1332,6 +1332,12 @@ DESIGN_CHECKS = setting(
 
 under("Vane chain")
 NEAR_STOP = setting(0.3, "mm", "A piston rests on its stop within this.", "judgement: a stop is known no better")
+SIMPLER_LINKAGE = setting(
+    2e-3,
+    "deg",
+    "The simpler model of a linkage, with one play a ring, leaves this of one with several pins.",
+    "benchmark: simulated logs without noise leave 0.0011 to 0.0022",
+)
 SIMPLER = setting(
     {"hydraulic": 4e-4, "electromechanical": 1.1e-3},
     "mm",
@@ -1486,6 +1492,16 @@ OTHER_CURRENT = setting(
     "share",
     "A logged current is another kind of sample than the mean since the row before where it misfits by this much less.",
     "judgement: clearly better, while both hold the same noise",
+)
+LOW_PASS_LASTS = setting(12.0, "delays", "After so many a low-pass has forgotten a value.", "principle: to a millionth")
+ROW_PARTS = setting(
+    50, "parts", "A low-pass is worked out in so many parts of a row.", "principle: its error is below 1 %"
+)
+NOISE_DRAWS = setting(
+    4,
+    "draws",
+    "So many tell how much of the noise behind a low-pass a noise floor shows.",
+    "budget of work: the draws differ by some per cent",
 )
 MOVES_ALIKE = setting(
     0.1,

@@ -18,7 +18,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.identification.settings import FLOOR_KNOWN, NOISE_KNOWN_TO
 
 __all__ = [
-    "Bound", "Effect", "Model", "Named", "Parameter", "Stage", "StageError", "noise_of", "reach_of",
+    "Bound", "Effect", "Model", "Named", "Parameter", "Stage", "StageError", "lifted", "noise_of", "reach_of",
     "size_of", "without_jumps",
 ]  # fmt: skip
 
@@ -243,8 +243,13 @@ def reach_of(stage: Stage, floor: Array, theta: Array) -> Array:
     """
     if stage.hidden is None or np.array_equal(theta[len(stage.parameters) :], stage.neutral()[len(stage.parameters) :]):
         return floor
-    reach = np.hypot(floor, stage.hidden(theta))
-    return np.where(reach > (1.0 + FLOOR_KNOWN) * floor, reach, floor)
+    return lifted(floor, stage.hidden(theta))
+
+
+def lifted(floor: Array, error: Array | float) -> Array:
+    """A noise floor with another independent error, where that lifts it by more than it is known to."""
+    both = np.hypot(floor, error)
+    return np.where(both > (1.0 + FLOOR_KNOWN) * floor, both, floor)
 
 
 def without_jumps(stage: Stage, error: Array) -> Array:

@@ -108,12 +108,14 @@ class Whole:
 
 
 def excerpted(log: Log, grid: Grid, stages_of: Callable[..., Chain], fitted: int = FITTED) -> Chain:
-    """The stages of an excerpt of a long log, of about so many rows (``fitted``).
+    """The stages of an excerpt of a long log, of about so many rows (``fitted``). What stands late in the excerpt does
+    so in all of the log.
 
     stages_of  function from the log, its grid and pieces of rows to their stages (`Machine.stages_of`)
     """
     whole = Whole(log, grid, partial(stages_of, log, grid))
-    return whole.chain(_everywhere(whole, spread(whole.pieces, max(2, fitted // whole.rows), ())))
+    chain = whole.chain(_everywhere(whole, spread(whole.pieces, max(2, fitted // whole.rows), ())))
+    return replace(chain, whole=replace(chain.whole, bind=partial(whole.bind, late=chain.late)))
 
 
 def _runs(pieces: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from controller import load_calibration
 from hil.logs import LogError
@@ -112,7 +112,7 @@ class Machine:
         grid = grid_of(log)
         return excerpted(log, grid, self.stages_of) if grid.rows > LONG else self.stages_of(log, grid)
 
-    def stages_of(self, log: Log, grid: Grid, pieces: Sequence[tuple[int, int]] = (), **few: int) -> Chain:
+    def stages_of(self, log: Log, grid: Grid, pieces: Sequence[tuple[int, int]] = (), **few: Any) -> Chain:
         """`bind` of some rows of a log, as `build_chain` takes them; default: of all."""
         from vaneloop.identification.vane_chain.chain import build_chain
 

@@ -26,10 +26,11 @@ from plant import chain
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
 from vaneloop.identification.settings import AGREES, EXPLAINED, LATE, MOVES_ALIKE, RASTER, WINDOW
 from vaneloop.identification.subsystem import Array, Stage
-from vaneloop.identification.vane_chain.current import AS_LOGGED, LOW_PASSES, LowPass, law_of
+from vaneloop.identification.vane_chain.current import law_of
+from vaneloop.identification.vane_chain.low_pass import AS_LOGGED, LOW_PASSES, LowPass
 from vaneloop.identification.vane_chain.subsystem_data import Made
 
-__all__ = ["Late", "LateIn", "aligned", "demand_of", "driving", "late_in_controller", "late_vanes"]
+__all__ = ["Late", "LateIn", "aligned", "demand_of", "driving", "late_in_controller", "late_vanes", "passed_by"]
 
 Both = tuple[Array, Array]  # the mean of a row's ticks, and the last of them
 LateIn = Mapping[str, tuple["Late", ...]]  # subsystem -> what stands late in it, against what it explains
@@ -41,7 +42,8 @@ class Late(NamedTuple):
     """Channels whose samples stand ``seconds`` late in the file at the middle of the log, and ``drift`` (s/s) more with
     each second; times count from the start of the log's stages.
 
-    passed  low-pass of the analogue channels that the servo's demand has not passed: it makes the delay, or part of it
+    passed  low-pass of the analogue channels: of a demand, which has not passed it, it makes the delay, or part of it;
+            of analogue channels that stand where they belong, all have passed it
     """
 
     channels: tuple[str, ...]
@@ -52,10 +54,17 @@ class Late(NamedTuple):
 
     def text(self) -> str:
         """What is said of it."""
+        if self.passed.kind and not self.seconds:
+            return f"{', '.join(self.channels)}: have passed {self.passed.text()}; the model's have, too"
         way = "late" if self.seconds >= 0.0 else "early"
         more = f", and {1e6 * self.drift:.3g} us more each second" if self.drift else ""
         more += f", because the analogue channels have passed {self.passed.text()}" if self.passed.kind else ""
         return f"{', '.join(self.channels)}: stand {abs(1e3 * self.seconds):.3g} ms {way} in the file{more}; moved"
+
+    @property
+    def besides(self) -> float:
+        """Seconds that no low-pass makes."""
+        return self.seconds + self.passed.delay
 
     def times(self, t: Array) -> Array:
         """The true times of samples that the file has at ``t`` (s)."""
@@ -66,6 +75,7 @@ def aligned(log: Log, late: Sequence[Late], start: float) -> Log:
     """The log with its strokes and angles where they belong; ``start``: s of its own time, where that of its stages is
     0.
     """
+    late = [one for one in late if one.seconds or one.drift]
     moved = {name: one for one in late for name in one.channels if name in log.channels and name not in DRIVING}
     channels = dict(log.channels)
     for name, one in moved.items():
@@ -79,13 +89,20 @@ def driving(t: Array, columns: dict[str, Array], late: Sequence[Late]) -> dict[s
     driven by them.
     """
     moved = {name: one for one in late for name in one.channels if name in columns and name in DRIVING}
-    return columns | {name: _shifted(t, columns[name], one.seconds) for name, one in moved.items()}
+    return columns | {name: _shifted(t, columns[name], one.besides) for name, one in moved.items()}
 
 
 def demand_of(late: Sequence[Late]) -> tuple[LowPass, tuple[Late, ...]]:
     """The low-pass that stroke and current have passed and the servo's demand has not; and all other offsets."""
     behind = next((one.passed for one in late if one.channels == DEMAND), AS_LOGGED)
     return behind, tuple(one for one in late if one.channels != DEMAND)
+
+
+def passed_by(late: Sequence[Late]) -> LowPass:
+    """The low-pass that what a subsystem explains has passed, and the model of it has not."""
+    return next(
+        (one.passed._replace(late=0.0) for one in late if one.passed.kind and one.channels != DEMAND), AS_LOGGED
+    )
 
 
 def late_in_controller(stages: Sequence[Stage]) -> LateIn:
@@ -101,8 +118,12 @@ def late_in_controller(stages: Sequence[Stage]) -> LateIn:
     demand_late = max([0.0, *(one.seconds for one in out.get("servo", ()) if one.channels == DEMAND)])
     if "demand" in of:
         out["demand"] = _one(of["demand"], ("n_r",), lambda d: d > -demand_late - LEAST_LATE * (demand_late > 0.0))
+    passed, _ = demand_of(out.get("servo", ()))
+    passed = passed._replace(late=0.0)
     if "engine" in of:
-        out["engine"] = _one(of["engine"], ("n_dem",), lambda d: True)
+        out["engine"] = _one(of["engine"], ("n_dem",), lambda d: True, passed)
+    if passed.kind and "linkage" in of:
+        out["linkage"] = out.get("linkage", ()) + _both_behind(of["linkage"], passed)
     return {name: late for name, late in out.items() if late}
 
 
@@ -276,30 +297,49 @@ def _explains(before: Array, after: Array) -> bool:
     return bool(np.all(after <= before * 1.0001) and left.sum() <= (1.0 - EXPLAINED) * excess.sum())
 
 
-def _moving(stage: Stage, of: Callable[[Array], Mapping[str, Array]]) -> Callable[[Array], Stage]:
-    """A function from offsets to the stage with other columns."""
+def _moving(
+    stage: Stage, of: Callable[[Array], Mapping[str, Array]], passed: LowPass | None = None
+) -> Callable[[Array], Stage]:
+    """A function from offsets to the stage with other columns, and what it explains behind a low-pass; None: as it
+    is.
+    """
     made = stage.made
     assert isinstance(made, Made)
+    passed = made.driven.passed if passed is None else passed
 
     def moved(late: Array) -> Stage:
-        return made.make(made.driven._replace(columns={**made.driven.columns, **of(late)}, again=True))
+        columns = {**made.driven.columns, **of(late)}
+        return made.make(made.driven._replace(columns=columns, passed=passed, again=True))
 
     return moved
 
 
-def _one(stage: Stage, channels: tuple[str, ...], allowed: Callable[[float], bool]) -> tuple[Late, ...]:
-    """One offset of ``channels`` that drive a stage against all else in it."""
+def _one(
+    stage: Stage, channels: tuple[str, ...], allowed: Callable[[float], bool], passed: LowPass = AS_LOGGED
+) -> tuple[Late, ...]:
+    """One offset of ``channels`` that drive a stage against all else in it, which may have ``passed`` a low-pass."""
     t, c = stage.t, stage.made.driven.columns  # type: ignore[attr-defined]
-    if _fits(stage):
+    if _fits(stage) and not passed.kind:
         return ()
 
     def of(late: Array) -> dict[str, Array]:
         return {name: _shifted(t, c[name], float(late[0])) for name in channels if name in c}
 
-    late, before, after = _fit(stage, _moving(stage, of), 1, RASTER)
-    if not _explains(before, after) or not allowed(float(late[0])) or abs(late[0]) >= LATE:
-        return ()
-    return (Late(channels, float(late[0])),)
+    found = []
+    for behind in dict.fromkeys((AS_LOGGED, passed, passed._replace(held=bool(passed.kind)))):
+        late, before, after = _fit(stage, _moving(stage, of, behind), 1, RASTER)
+        if _explains(before, after) and allowed(float(late[0])) and abs(late[0]) < LATE:
+            one = Late(channels, float(late[0]) - behind.delay, passed=behind._replace(late=-float(late[0])))
+            found.append((float(after.sum()), one if behind.kind else Late(channels, float(late[0]))))
+    return (min(found, key=lambda x: x[0])[1],) if found else ()
+
+
+def _both_behind(stage: Stage, passed: LowPass) -> tuple[Late, ...]:
+    """Stroke and vanes behind a low-pass that the controller's channels have passed, unless that leaves more."""
+    t, c = stage.t, stage.made.driven.columns  # type: ignore[attr-defined]
+    stroke = passed.before(c.get("stroke", c["x_lvdt"]), float(t[1] - t[0]))
+    _, before, after = _fit(stage, _moving(stage, lambda _: {"stroke": stroke}, passed), 0)
+    return (Late(("x_lvdt", *stage.outputs), 0.0, passed=passed),) if after.sum() < before.sum() else ()
 
 
 def _fits(stage: Stage) -> bool:

@@ -43,9 +43,10 @@ from vaneloop.identification.settings import (
     OTHER_CURRENT,
     RASTER,
     SETTLE,
+    SIMPLER_LINKAGE,
     WINDOW,
 )
-from vaneloop.identification.subsystem import Array, Stage, noise_of
+from vaneloop.identification.subsystem import Array, Stage, lifted, noise_of
 from vaneloop.identification.vane_chain.actuator import actuator_stage
 from vaneloop.identification.vane_chain.alignment import (
     Late,
@@ -55,6 +56,7 @@ from vaneloop.identification.vane_chain.alignment import (
     driving,
     late_in_controller,
     late_vanes,
+    passed_by,
 )
 from vaneloop.identification.vane_chain.candidates import OF_STROKE, reversals, room_for
 from vaneloop.identification.vane_chain.current import (
@@ -108,6 +110,7 @@ class Chain:
     test          the stages on a part of the log that nothing is fitted to; None: there is none
     whole         of a long log, of which these are the stages of an excerpt: all of it; None: it is here whole
     start         s of the log's own time, where ``t`` is 0
+    late          what stands late in the file, by subsystem, and was moved
     plant, built, calibration  the machine; its controller's tables, and the same as flashed (`hil.loop.tick.flashed`)
     """
 
@@ -123,6 +126,7 @@ class Chain:
     test: Chain | None = None
     whole: Any = None
     start: float = 0.0
+    late: LateIn = field(default_factory=dict)
 
     def stage(self, name: str) -> Stage:
         """Return a stage by name."""
@@ -137,6 +141,7 @@ def build_chain(
     grid: Grid | None = None,
     pieces: Sequence[tuple[int, int]] = (),
     draws: int = CURRENT_DRAWS,
+    late: LateIn | None = None,
 ) -> Chain:
     """Put ``log`` on one raster and make every stage that its channels allow, each of the rows that its own have;
     channels that stand late in the file are moved to where they belong (`alignment`).
@@ -145,15 +150,17 @@ def build_chain(
     grid     of the log, where it is known
     pieces   rows of it, as `on_raster` takes them: the stages of these only
     draws    of what the log hides from the servo
+    late     what stands late in the log, where that is known; None: it is to be found
     """
-    late: dict[str, tuple[Late, ...]] = {}
-    chain = _build(log, plant, calibration, present, grid, pieces, draws, late)
+    known = late or {}
+    chain = _build(log, plant, calibration, present, grid, pieces, draws, known)
     framed = any(c.framed for c in log.channels.values())  # frames are stamped by one clock
-    for find in () if pieces or framed else (late_in_controller, late_vanes):
+    for find in () if late is not None or framed else (late_in_controller, late_vanes):
         if found := find(chain.stages):
-            late |= {name: late.get(name, ()) + more for name, more in found.items()}
-            chain = _build(log, plant, calibration, present, grid, (), draws, late)
-    chain.notes += _moved(late)
+            known = {**known, **{name: known.get(name, ()) + more for name, more in found.items()}}
+            chain = _build(log, plant, calibration, present, grid, pieces, draws, known)
+    chain.notes += _moved(known)
+    chain.late = known
     return chain
 
 
@@ -257,6 +264,7 @@ def _chain(
     all of its rows is left out, but for what is explained.
     """
     behind, late = demand_of(late)
+    passed = passed_by(late)
     log = aligned(log, late, grid.start)
     cal = flashed(tables, machine)
     theirs = tables.program is not None  # a controller of the user's own: its servo's law is not known
@@ -340,6 +348,8 @@ def _chain(
                 between_rows(have, law, size, both.run, cal, unknown, seed) for seed in (0, 1)
             )
         have["stroke"] = smooth.stroke
+    if "linkage" in names and "x_lvdt" in have and passed.kind:
+        have["stroke"] = passed.before(have.get("stroke", have["x_lvdt"]), dt)
     coarse_current = None
     if dt > 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
         what = _slow_current(Driven(t, have, machine, cal, ("x_lvdt",), motion.currents, present))
@@ -371,7 +381,10 @@ def _chain(
         have |= own.columns()
         # how much of the rotor speed's noise is an error of the demand, only a whole log tells
         told = name == "demand" and bool(pieces)
-        driven = Driven(t, dict(have), machine, cal, outputs, rows, present, turns=turns, assumed=assumed, again=told)
+        driven = Driven(
+            t, dict(have), machine, cal, outputs, rows, present, turns=turns, assumed=assumed, passed=passed,
+            again=told,
+        )  # fmt: skip
         make = make_of[name]
         stage = make(driven)
         stage.regimes, stage.regime_units = regimes, units
@@ -407,8 +420,13 @@ def _chain(
             freed = noise_floor(t, np.where(np.isfinite(stage.measured[0]), smooth.off, np.nan))
             stage.quiet = np.maximum([min(channel, freed)], least)
         stage.memory = CHAIN_MEMORY
-        stage.noise = lambda when, error, least=least: max(noise_floor(when, error), least)
+        shown = passed.shown(t)
+        stage.noise = lambda when, error, least=least, shown=shown: max(noise_floor(when, error) / shown, least)
         stage.floor = noise_of(stage, stage.neutral())
+        if name == "linkage" and np.any(lifted(stage.floor, SIMPLER_LINKAGE) > stage.floor):
+            stage.raster_error = np.hypot(0.0 if stage.raster_error is None else stage.raster_error, SIMPLER_LINKAGE)
+            stage.raster_error = np.broadcast_to(stage.raster_error, stage.floor.shape)
+            stage.floor = noise_of(stage, stage.neutral())
         stages.append(stage)
     return Chain(t, stages, absent, columns, machine, tables, cal, notes, steps, start=grid.start)
 

@@ -32,70 +32,15 @@ from vaneloop.identification.settings import (
     WINDOW,
 )
 from vaneloop.identification.subsystem import Array
+from vaneloop.identification.vane_chain.low_pass import AS_LOGGED, LowPass, lagged
 
 __all__ = [
-    "AS_LOGGED", "BEFORE", "LOW_PASSES", "SAMPLED", "SLOW_CURRENTS", "LowPass", "Smooth", "between_rows", "law_of",
-    "other_current", "samples_of", "servo_law", "without_noise",
+    "BEFORE", "SAMPLED", "SLOW_CURRENTS", "Smooth", "between_rows", "law_of", "other_current", "samples_of",
+    "servo_law", "without_noise",
 ]  # fmt: skip
 
 SAMPLED = "the current at single ticks"
 BEFORE = "the mean of the ten ticks before the row"
-
-
-class LowPass(NamedTuple):
-    """What a recorder's low-pass does to a channel, beside one that did not pass it.
-
-    kind   of `LOW_PASSES`; "": none
-    delay  s, of slow motions, that the low-pass makes
-    late   s, by which the channel stands late besides; below 0, the other one is late
-    """
-
-    kind: str = ""
-    delay: float = 0.0
-    late: float = 0.0
-
-    def of(self, ticks: Array) -> Array:
-        """The same of values at ticks, of any shape that runs through all of them."""
-        out = LOW_PASSES[self.kind](ticks.ravel(), self.delay / chain.TICK) if self.kind else ticks.ravel()
-        at = np.arange(float(len(out)))
-        return np.interp(at - self.late / chain.TICK, at, out).reshape(ticks.shape)
-
-    def text(self) -> str:
-        """What it is, as its data sheet would say it."""
-        if not self.kind:
-            return ""
-        if self.kind == "mean":
-            return f"a mean over {2e3 * self.delay:.3g} ms"
-        corner = {"first order": 1.0, "second order": 2.0**0.5}[self.kind] / (2.0 * np.pi * self.delay)
-        return f"a low-pass of {self.kind} of {corner:.3g} Hz"
-
-
-AS_LOGGED = LowPass()
-
-
-def _mean_of(x: Array, delay: float) -> Array:
-    """Mean over the 2 ``delay`` ticks before."""
-    width, at = max(2.0 * delay, 1.0), np.arange(len(x) + 1.0)
-    total = np.concatenate([[0.0], np.cumsum(x)])
-    before = np.interp(at[1:] - width, at, total) + x[0] * np.minimum(at[1:] - width, 0.0)
-    return np.asarray((total[1:] - before) / width)
-
-
-def _first_order(x: Array, delay: float) -> Array:
-    share = 0.5 / (delay + 0.5)  # by the bilinear transformation
-    return x[0] + _lagged(0.5 * (x + np.concatenate([x[:1], x[:-1]])) - x[0], 2.0 * share)
-
-
-def _second_order(x: Array, delay: float) -> Array:
-    """A filter of Butterworth of the second order, whose delay is the root of 2 over its corner."""
-    b, a = scipy.signal.butter(2, min(2.0**0.5 / max(delay, 1e-3) / np.pi, 0.99))
-    return x[0] + np.asarray(scipy.signal.lfilter(b, a, x - x[0]))
-
-
-# What a recorder may have before its analogue channels, of a delay in ticks.
-LOW_PASSES: Mapping[str, Callable[[Array, float], Array]] = {
-    "mean": _mean_of, "first order": _first_order, "second order": _second_order
-}  # fmt: skip
 
 
 def servo_law(
@@ -365,7 +310,7 @@ def _calibrated(step: Array, dt: float, logged: Array, whole: Array) -> Array:
     Least squares by triangles of the rows piece by piece, which stay in the processor's cache.
     """
     bends = [0.0, *np.quantile(np.abs(step), FLOW_BENDS)]
-    late = [_lagged(step, 1.0 - np.exp(-dt / lag)) for lag in CURRENT_LAGS]
+    late = [lagged(step, 1.0 - np.exp(-dt / lag)) for lag in CURRENT_LAGS]
     around = np.concatenate([step[-1:], step, step[:1]])
     pieces, triangles = [], []
     for i in range(0, len(step), TRIANGLE_ROWS):
@@ -395,16 +340,6 @@ def _smoothed(x: Array, rows: int) -> Array:
     out, half, at = np.asarray(scipy.ndimage.convolve1d(x, _weights(rows), mode="constant")), rows // 2, np.arange(rows)
     out[:half] = np.polyval(np.polyfit(at, x[:rows], SMOOTH_ORDER), at[:half])
     out[-half:] = np.polyval(np.polyfit(at, x[-rows:], SMOOTH_ORDER), at[-half:])
-    return out
-
-
-@compiled
-def _lagged(x: Array, share: float) -> Array:
-    """A lag that goes ``share`` of the way in each row, from 0."""
-    out, y = np.empty(len(x)), 0.0
-    for k in range(len(x)):
-        y = share * x[k] - (share - 1.0) * y
-        out[k] = y
     return out
 
 

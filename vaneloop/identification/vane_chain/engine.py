@@ -47,10 +47,9 @@ def engine_stage(driven: Driven) -> Stage:
                 inside = slice(piece.start * inner, stop * inner)
                 s[places.N_R] = start
                 engine_run(n_dem[inside], dt / inner, p, s, out[inside], np.ascontiguousarray(known[:, inside]))
-                start = start + np.mean(
-                    c["n_r"][piece.start : head, None] - out[piece.start * inner : head * inner : inner], axis=0
-                )
-        return out[::inner].T[:, None, :]
+                began = driven.passed.of_rows(out[piece.start * inner : head * inner : inner].T, dt).T
+                start = start + np.mean(c["n_r"][piece.start : head, None] - began, axis=0)
+        return driven.passed.of_rows(out[::inner].T[:, None, :], dt)
 
     measured = driven.measured(run)
     stage = Stage("engine", outputs, ("%",), parameters, effects, simulate, t, measured)

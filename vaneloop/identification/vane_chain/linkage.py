@@ -40,7 +40,7 @@ def linkage_stage(driven: Driven) -> Stage:
         out = np.empty((len(thetas), len(first), len(t)))
         linkage_run(x, n_r, t_oil, t, dt, p, s, out.transpose(2, 1, 0), driven.slipping(signals, p))
         out = out if which == list(range(len(first))) else out[:, which]
-        return np.asarray(np.rad2deg(out, out=out))
+        return driven.passed.of_rows(np.rad2deg(out, out=out), dt)
 
     # until the stroke has crossed the play twice over, nobody knows where in it the rings started; nor where they were
     # left at full speed by a controller that had to catch up, which turns between two rows

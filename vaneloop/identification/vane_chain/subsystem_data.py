@@ -21,6 +21,7 @@ from vaneloop.identification.subsystem import Array, Effect, Stage
 from vaneloop.identification.user_models.hysteresis_regressors import lagged
 from vaneloop.identification.user_models.motion import smoothed
 from vaneloop.identification.user_models.simulation import Placed
+from vaneloop.identification.vane_chain.low_pass import AS_LOGGED, LowPass
 
 __all__ = ["SAMPLED_OF", "Driven", "Made", "excerpts"]
 
@@ -39,6 +40,7 @@ class Driven(NamedTuple):
     curves               what may be tried besides: curves as they run, and as the search has them
     turns                what follows from the whole stroke (`ground.reversals`), worked out when it is asked for
     assumed              channels that nobody logged: standard deviation of the value in their place, border units
+    passed               low-pass that what the stage explains has passed; a stroke in ``columns`` is that before it
     part_of              of an excerpt: the whole, and which of its rows these are
     again                whether the stage takes its noise over, as one does that was made of this log before: it is not
                          estimated
@@ -55,6 +57,7 @@ class Driven(NamedTuple):
     curves: tuple[tuple[Placed, Effect], ...] = ()
     turns: Callable[[], dict[str, Array]] = dict
     assumed: Mapping[str, float] = MappingProxyType({})
+    passed: LowPass = AS_LOGGED
     part_of: tuple[Driven, Array | slice] | None = None
     again: bool = False
 
