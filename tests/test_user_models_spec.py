@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy
+from numba.core.compiler import run_frontend
 
 from hil.logs.notes import Note
 from plant.model import Learned
@@ -42,7 +43,7 @@ from vaneloop.identification.user_models.hysteresis_regressors import forgotten,
 from vaneloop.identification.user_models.injection_points import _size, nominal_course
 from vaneloop.identification.user_models.load import load_system
 from vaneloop.identification.user_models.motion import differentiated_to, highest_frequency, low_pass, motion, smoothed
-from vaneloop.identification.user_models.user_code import cannot
+from vaneloop.identification.user_models.user_code import UserCode, _ends, cannot
 from vaneloop.identification.user_models.user_laws import Law
 
 # docs/settings.md
@@ -1067,8 +1068,10 @@ def test_a_force_that_goes_the_wrong_way_for_its_law_is_said() -> None:
     judge = LeastSquaresProblem(bound.thinned, bound.floor)
     d = as_given(Logs(bound, None), judge.fit((), bound.stage.neutral()))
     fit = judge.fit(("force.spring",), bound.stage.neutral())
-    fit.theta[bound.stage.index()["force.spring"]] = -0.25
     d.final = fit
+    fit.theta[bound.stage.index()["force.spring"]] = 0.25
+    assert not any("negative" in s for s in parameter_warnings(bound, judge, d))
+    fit.theta[bound.stage.index()["force.spring"]] = -0.25
     (said,) = [s for s in parameter_warnings(bound, judge, d) if s.startswith("force.spring is negative")]
     assert said.startswith(
         "force.spring is negative (-0.25 (N)/(mm)): it pushes away from the middle instead of back to it; "
@@ -1757,11 +1760,6 @@ def test_an_input_that_runs_in_a_smooth_curve_is_integrated_as_one() -> None:
     assert off["smooth"] < 1e-3 < off["line"] < 0.02 < off["hold"]
 
 
-def test_a_static_model_that_gives_too_much_is_said_at_once() -> None:
-    with pytest.raises(StageError, match="^system 'map': "):
-        BoundSystem(mapping(model=lambda u, p: (u.u, u.u)), [record(u=U, y=Y)])
-
-
 def test_a_model_file_may_use_former_names_and_classes_of_its_own(tmp_path: Path) -> None:
     at = tmp_path / "model.py"
     own = "from __future__ import annotations\nfrom dataclasses import dataclass\n@dataclass\nclass Own:\n    a: int\n"
@@ -1773,3 +1771,117 @@ def test_a_model_file_may_use_former_names_and_classes_of_its_own(tmp_path: Path
     at.write_text(FILE.format("import discrepancy; discrepancy.nothing", ""))
     with pytest.raises(StageError, match="AttributeError: module 'discrepancy' has no attribute 'nothing'$"):
         load_system(at)
+
+
+# ---- what a user's function returns ----------------------------------------------------------------------------------
+
+
+def a_list(x: Any, y: Any) -> Any:
+    out = [x, y]
+    return out
+
+
+def an_array(x: Any, y: Any) -> Any:
+    return np.array([x, y])
+
+
+def either(x: Any, y: Any) -> Any:
+    if x > 0.0:
+        return [x, y]
+    return y, x
+
+
+def of_two_lengths(x: Any, y: Any) -> Any:
+    if x > 0.0:
+        return [x, y]
+    return [x]
+
+
+def a_tuple(x: Any, y: Any) -> Any:
+    return x, y
+
+
+def used_again(x: Any, y: Any) -> Any:
+    out = [x, y]
+    out.append(x)
+    return out
+
+
+def of_a_kind(x: Any, y: Any) -> Any:
+    return np.array([x, y], np.float32)
+
+
+def added(x: Any, y: Any) -> Any:
+    return x + y
+
+
+def empty(x: Any, y: Any) -> Any:
+    return []
+
+
+@pytest.mark.parametrize(
+    ("function", "lists"),
+    [
+        (a_list, [False]), (an_array, [True]), (either, [False]), (of_two_lengths, []), (a_tuple, []),
+        (used_again, []), (of_a_kind, []), (added, []), (empty, []),
+    ],
+)  # fmt: skip
+def test_a_list_that_only_is_returned_is_known_as_one(function: Any, lists: list[bool]) -> None:
+    """Of each return of a list: whether an array is made of it."""
+    ends = _ends(run_frontend(function))
+    assert [array is not None for _, array in ends] == lists
+    assert all(made.value.op == "build_list" and len(made.value.items) == 2 for made, _ in ends)
+
+
+@pytest.mark.parametrize(
+    ("model", "said"),
+    [
+        (lambda u, p: (u.u, u.u), "model returned 2 values; 1 are needed (y)"),
+        (lambda u, p: u.u[1:], "model returned shape (59,) for y; (60,) is needed, one value a sample"),
+        (lambda u, p: np.where(u.u > 0.5, np.nan, u.u), "model returned nan for y at t = 0.6 s; it must be finite"),
+    ],
+)
+def test_a_static_model_that_gives_something_else_is_said_at_once(model: Any, said: str) -> None:
+    with pytest.raises(StageError) as e:
+        BoundSystem(mapping(model=model), [record(u=U, y=Y)])
+    assert str(e.value) == f"system 'map': {said}"
+    both = System("two", "static", lambda u, p: np.array([u.u, 2.0 * u.u]), {"y": "V", "z": "V"}, {"u": "A"})
+    code = UserCode(both, ["u"])
+    assert code.static(np.zeros(0), U[None], T) == pytest.approx(np.array([U, 2.0 * U]))
+    assert code.static(np.zeros(0), np.zeros((1, 60)), T).shape == (2, 60)
+    level = UserCode(mapping(model=lambda u, p: p.a), ["u"])
+    assert level.static(np.array([3.0]), U[None], T).tolist() == [[3.0] * 60]
+
+
+@pytest.mark.parametrize(
+    ("model", "said"),
+    [
+        (lambda x, u, p: (u.u, 1.0), "model returned 2 values; 1 are needed (y)"),
+        (lambda x, u, p: [np.zeros(3)], "model returned an array of shape (3,) for y; a number is needed"),
+        (lambda x, u, p: None, "model returned None for y at the first sample; a number is needed"),
+        (lambda x, u, p: np.inf, "model returned inf for y at the first sample; it must be finite"),
+    ],
+)
+def test_a_rate_that_is_no_number_is_said_at_the_first_sample(model: Any, said: str) -> None:
+    system = System("lag", "simulate", model, {"y": "V"}, {"u": "V"}, states={"y": "V"})
+    with pytest.raises(StageError) as e:
+        UserCode(system, ["u"]).try_once([0.7], np.array([1.0]), np.array([0.7]))
+    assert str(e.value) == f"system 'lag': {said}"
+
+
+def drained(v: Any, t: Any, p: Any) -> Any:
+    return NUMBERS["one"] * p.by * v
+
+
+def test_an_own_law_of_a_state_is_taken_off_its_rate() -> None:
+    own = Law("drained", "state", drained, [Parameter("by", 0.0, "1/s", -5.0, 5.0)], [1.0, -1.0], places=["y"])
+    system = System(
+        "lag", "simulate", decay, {"y": "V"}, {"u": "V"}, [Parameter("c", 0.8, "1/s")], states={"y": "V"},
+        start={"y": 0.7}, places=["state"], laws=[own],
+    )  # fmt: skip
+    bound = BoundSystem(system, [driven_decay(1, 0.7)])
+    theta = bound.stage.neutral()
+    (name,) = (e.name for e in bound.stage.effects if e.name.endswith(".drained"))
+    theta[bound.stage.index()[name]] = 0.3
+    wanted = integrated(lambda t, x, u: u - 1.1 * x, bound.data.u[0][0], 0.7)
+    assert bound.run(theta[None])[0, 0] == pytest.approx(wanted, abs=4e-3 * np.abs(wanted).max())
