@@ -22,6 +22,7 @@ from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import StageDiagnosis, rms_of
 from vaneloop.identification.selection import likelihood_acceptance as likelihood
+from vaneloop.identification.selection import subsampled_search
 from vaneloop.identification.selection.calibration import trust
 from vaneloop.identification.selection.diagnosis import _search, diagnose_stage, extend_stage
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
@@ -467,6 +468,10 @@ def test_what_is_promised_of_a_linear_stage_is_what_scipy_finds(
         there = np.append(e0 + share[0] * d, [0.0, 0.0])
         least = np.linalg.lstsq(a, there, rcond=None)[0]
         assert promise[0] == pytest.approx(np.sum((there - a @ least) ** 2), rel=1e-6, abs=1e-6)
+    share, promise = slopes.line(slopes.error[None])  # a way of no length goes nowhere
+    assert share[0] == SCREEN_LINE[0]
+    least = np.linalg.lstsq(a, np.append(e0, [0.0, 0.0]), rcond=None)[0]
+    assert promise[0] == pytest.approx(np.sum((np.append(e0, [0.0, 0.0]) - a @ least) ** 2), rel=1e-6, abs=1e-6)
 
 
 @given(size=st.floats(-9.0, 9.0), other=st.floats(-9.0, 9.0), share=st.floats(0.0, 12.0))
@@ -517,6 +522,12 @@ def test_freedom_is_half_the_log_of_what_the_data_narrowed(seed: int, correlatio
     fit.prior = np.array([3.0])  # but by one that is known beforehand
     expected = 0.5 * np.log((N * slope**2 / correlation + 12.0) / 12.0)
     assert likelihood._freedom(judge, fit, correlation) == pytest.approx(expected)
+    fit.prior = np.zeros(1)  # and by a shape, which may be anywhere within its bounds: as evenly as a ruler's marks
+    for low, high in ((-1.0, 3.0), (2.0, 6.0)):
+        stage.all_parameters = lambda low=low, high=high: (Parameter("share", low, "-", low, high, shape=True),)
+        variance = (high - low) ** 2 / 12.0 / judge.scale[0] ** 2
+        expected = 0.5 * np.log(N * slope**2 / correlation * variance + 1.0)
+        assert likelihood._freedom(judge, fit, correlation) == pytest.approx(expected)
 
 
 def test_a_threshold_has_the_interval_within_which_the_error_is_as_good() -> None:
@@ -982,3 +993,16 @@ def test_an_excerpt_is_half_evenly_spaced_and_half_where_the_model_fails_most(
     told = np.unique(excerpt_of(judge, fit, piece, many * piece) // piece)
     if count <= (pieces + 1) // 2:
         assert not np.any(told % 2)
+
+
+def test_a_search_is_sent_ahead_where_a_stage_is_twice_as_long_as_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("Search", "SubsampledSearch"):
+        monkeypatch.setattr(subsampled_search, name, lambda *given, name=name: (name, *given))
+    known: Any = object.__new__(LikelihoodAcceptance)
+    for criterion, n, excerpt, ahead in (
+        (known, 16_000, abs, True), (known, 15_999, abs, False), (known, 16_000, None, False),
+        (SimpleNamespace(), 16_000, abs, False),
+    ):  # fmt: skip
+        criterion.judge = SimpleNamespace(stage=SimpleNamespace(excerpt=excerpt, t=range(n)))
+        wanted = ("SubsampledSearch", criterion, max, None) if ahead else ("Search", criterion, None)
+        assert subsampled_search.searched(criterion, max, None) == wanted  # type: ignore[arg-type, comparison-overlap]
