@@ -1610,6 +1610,9 @@ def test_rivals_are_judged_with_the_other_effects_of_their_subsystem(monkeypatch
         ("actuator", "lvdt_bias", "valve_lag", (), machine),
         ("actuator", "a", "valve_lag", ("lvdt_bias",), machine),
     ]  # fmt: skip
+    monkeypatch.setattr(experiment, "divergence", lambda *_, **__: (1000.0, 10.0))
+    once = experiment.recommend(d, None, of)
+    assert once is not None and once["separates"] and once["repeats"] == 1 and "times over" not in once["text"]
 
 
 def test_a_current_of_single_ticks_is_made_the_mean_of_its_ticks(machine_log: Log, chain: Chain) -> None:
@@ -1630,3 +1633,35 @@ def test_a_current_of_single_ticks_is_made_the_mean_of_its_ticks(machine_log: Lo
     unknown = (c["other_ticks"].mean(axis=1) - c["i_cmd"])[run]
     as_was = (own["other_ticks"].mean(axis=1) - own["i_cmd"])[run]
     assert np.std(as_was) < 1e-9 < np.std(unknown)
+
+
+def test_of_vanes_that_all_end_early_the_first_is_named(machine_log: Log) -> None:
+    cut = {v: Channel(machine_log[v].t[:1500], machine_log[v].values[:1500]) for v in ("vigv", "vgv1", "vgv2")}
+    ended = chain_of(with_(machine_log, n_dem=None, x_dem=None, **cut))
+    assert list(ended.notes) == ["vigv ends at 14.99 s: linkage not judged after it"]
+    assert len(ended.stage("linkage").t) == 1500 and len(ended.stage("actuator").t) == 2400
+
+
+def test_signals_of_a_machine_s_own_law_are_behind_its_lag(chain: Chain) -> None:
+    law = learned("linkage.ring", "adds", "x_lvdt_lagged_by_300_ms", 2.0, 40.0, 0.0, 0.1, 0.2, 0.3)
+    machine = Model(curves={"law": law}, effects={"law": {}}).plant(build_plant())
+    driven = driven_of(chain.stage("linkage"))
+    signals = driven._replace(machine=machine).signals()
+    late = driven.quantity("x_lvdt_lagged_by_300_ms")
+    assert late is not None and len(signals) == KNOWN + 1 and signals[-1] == pytest.approx(1e-3 * late)
+
+
+def test_a_controller_of_the_user_s_own_has_no_servo_that_is_known(
+    machine_log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(n_dem: Array, n_r: Array, *rest: Any) -> None:
+        rest[-1][:] = 1e-3 * np.interp(n_r, [50.0, 100.0], [0.0, 40.0])
+
+    monkeypatch.setattr(demand, "_run", run)
+    own = CALIBRATION._replace(program=SimpleNamespace(start=lambda flashed: ()))
+    without = with_(machine_log, vigv=None, vgv1=None, vgv2=None)
+    c = chain_of(without, calibration=own)
+    assert [s.name for s in c.stages] == ["demand", "engine", "actuator"]
+    said = "a controller of your own gives its current for its own demand, not for the logged one"
+    assert c.not_observed["servo"] == said
+    assert "ticks" not in driven_of(c.stage("actuator")).columns
