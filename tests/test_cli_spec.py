@@ -361,8 +361,9 @@ def group(**more: Any) -> SimpleNamespace:
     )  # fmt: skip
     held = SimpleNamespace(expected="no fault", broken=0, trials=9, least=0.5, unit="s", fails=False)
     given: dict[str, Any] = {
-        "name": "gust", "failed": 2, "trials": 9, "low": 0.03, "high": 0.6, "least": -0.5, "by_search": True,
-        "same": False, "requirements": [rule, held], "alone": {"its bus": 3}, "lost": 1, "runs": 0,
+        "name": "gust", "failed": 2, "trials": 9, "low": 0.03, "high": 0.6, "least": -0.5, "found_by": "search",
+        "same": False, "reproduces": False, "rare": None, "counted": "", "failures": [], "saved_failures": lambda: "",
+        "requirements": [rule, held], "alone": {"its bus": 3}, "lost": 1, "runs": 0,
         "command": "vaneloop campaign again",
     }  # fmt: skip
     return SimpleNamespace(**given | more)
@@ -370,7 +371,10 @@ def group(**more: Any) -> SimpleNamespace:
 
 def test_a_campaign_is_told_and_written_for_junit(tmp_path: Path, capsys: Said) -> None:
     view: Any = SimpleNamespace(
-        groups=[group(), group(name="calm", failed=0, requirements=[], alone={}, lost=0, runs=4, same=True)],
+        groups=[
+            group(),
+            group(name="calm", failed=0, requirements=[], alone={}, lost=0, runs=4, same=True, reproduces=True),
+        ],
         passed=lambda g: g.name == "calm", confidence=0.95, title="a campaign", allowed=None,
         sentence=lambda: "so it is",
     )  # fmt: skip

@@ -115,6 +115,9 @@ def test_a_recalibrated_model_may_go_where_the_table_allows_and_no_farther(table
     plain, model = chain(table), chain(table, Model(parameters=moved))
     for one, other in zip(plain.stages, model.stages, strict=True):
         for p, q in zip(one.parameters, other.parameters, strict=True):
+            if p.name == "onset":
+                assert p == q
+                continue
             n = known[p.name]
             assert p.expected == q.expected == n.value and p.value == n.value
             assert q.value == pytest.approx(moved[p.name], rel=1e-9)

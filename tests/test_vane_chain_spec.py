@@ -798,7 +798,7 @@ def test_channels_that_a_recorder_has_late_are_told_in_each_subsystem(
 
 
 def build_chain_as_it_is(log: Log) -> Chain:
-    return build_chain(log, grid=grid_of(log), pieces=[(0, grid_of(log).rows)])
+    return build_chain(log, late={})
 
 
 # ---- curves that nobody named
@@ -1562,7 +1562,9 @@ def test_a_curve_in_the_servo_changes_its_current_by_its_value(chain: Chain) -> 
     # of the current that the law itself gives, which has no noise: a hundredth of it
     line = curve_effect("law", learned("servo.current", "adds", "i_cmd", -60.0, 60.0, -0.6, -0.2, 0.2, 0.6))
     with_it = remade(stage, (), [line])
-    still, by = with_it.run(np.array([[0.0], [5.0]]))[:, 0]
+    thetas = np.array([with_it.neutral()] * 2)
+    thetas[1, -1] = 5.0
+    still, by = with_it.run(thetas)[:, 0]
     assert by == pytest.approx(1.05 * still, abs=1e-3) and np.abs(still).max() < 60.0
     law = curve_effect("law", learned("controller.demand", "adds", "n_r", 0.0, 100.0, 0.1, 0.1, 0.1, 0.1))
     demand = remade(chain.stage("demand"), (), [law])

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from controller import load_calibration
 from hil.logs import LogError
@@ -14,11 +14,13 @@ from hil.native import Program
 from plant import Model, build_plant, load_model
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import same_stages
+from vaneloop.identification.settings import CURRENT_DRAWS
 
 if TYPE_CHECKING:
     from controller import Calibration
     from hil.logs import Log
     from plant import Plant
+    from vaneloop.identification.vane_chain.alignment import LateIn
     from vaneloop.identification.vane_chain.chain import Chain
     from vaneloop.identification.vane_chain.resample import Grid
 
@@ -112,12 +114,15 @@ class Machine:
         grid = grid_of(log)
         return excerpted(log, grid, self.stages_of) if grid.rows > LONG else self.stages_of(log, grid)
 
-    def stages_of(self, log: Log, grid: Grid, pieces: Sequence[tuple[int, int]] = (), **few: Any) -> Chain:
+    def stages_of(
+        self, log: Log, grid: Grid, pieces: Sequence[tuple[int, int]] = (), draws: int = CURRENT_DRAWS,
+        late: LateIn | None = None,
+    ) -> Chain:  # fmt: skip
         """`bind` of some rows of a log, as `build_chain` takes them; default: of all."""
         from vaneloop.identification.vane_chain.chain import build_chain
 
         present = tuple(self.added.effects)
-        chain = build_chain(log, self.plant, self.calibration, present, grid, pieces, **few)
+        chain = build_chain(log, self.plant, self.calibration, present, grid, pieces, draws, late)
         if not chain.stages:
             why = "; ".join(f"{k}: {v}" for k, v in chain.not_observed.items())
             raise LogError(f"{log.path}: no subsystem can be judged ({why})")
