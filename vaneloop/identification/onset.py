@@ -3,8 +3,8 @@
 The time is a parameter of a stage, ``onset``, which no fit sets free: before it the stage runs with every effect at its
 neutral size, from it on with the effects. Errors do not depend on it smoothly, so that it is found as a change point:
 up to where the model without effects stands at the noise (`quiet_until`), then as the time at which the sum of squares
-of a model with effects is least (`change_point`). Killick, Fearnhead, Eckley (2012), optimal detection of changepoints
-with a linear computational cost.
+of a model with effects is least (`change_point`). Its interval: B. E. Hansen, Econometrica 68 (2000) 575-603, sample
+splitting and threshold estimation.
 """
 
 from __future__ import annotations

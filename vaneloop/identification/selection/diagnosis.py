@@ -206,7 +206,7 @@ def _whenever(
     for _ in range(ONSET_ROUNDS):
         if at is None:
             break
-        later = begun(stage, at)
+        last, later = at, begun(stage, at)
         found = ask(later)
         fit, judge = found.final, LeastSquaresProblem(stage, found.floor, keep)
         if not fit.effects:  # a block is too coarse for an answer: the time follows from what comes nearest to one
@@ -224,11 +224,12 @@ def _whenever(
             when = change_point(judge, fit, correlation)
         if settled and found.verdict == "missing":
             thetas = np.array([said.final.theta, found.final.theta])
-            always, later = judge.totals(judge.errors(thetas), thetas)
-            case = Beginning(0.5 * float(always - later) / correlation, judge.n_blocks)
+            always, begins = judge.totals(judge.errors(thetas), thetas)
+            case = Beginning(0.5 * float(always - begins) / correlation, judge.n_blocks)
             decisions = Decisions(found.decisions)
             if decisions.decide([BEGINS], case, found.final.effects, said.final.effects):
                 return replace(found, onset=when, decisions=list(decisions))
+        if at == last:
             break
     return said
 
