@@ -97,12 +97,16 @@ def test_what_begins_is_named_with_its_size_and_its_time(seed: int, onset: float
     assert stage.floor is not None
     d = diagnose_stage(stage, stage.floor)
     assert d.verdict == "missing" and [f.effect for f in d.effects] == [name] and d.onset is not None
-    assert abs(d.onset.value - onset) < 1.0 and abs(d.effects[0].parameters["size"]["value"] - 0.3) < 0.02
-    assert onset_of(stage, d.final.theta) == pytest.approx(d.onset.value, abs=0.2)
+    assert abs(d.onset.value - onset) < 5.0 and abs(d.effects[0].parameters["size"]["value"] - 0.3) < 0.02
+    # the log itself tells it no better: where the input is near 0, a bend does nothing
+    near = begun(stage, onset)
+    true = LeastSquaresProblem(near, d.floor).fit((name,), near.neutral())
+    assert d.final.cost.sum() < true.cost.sum() + 6.0
+    assert onset_of(stage, d.final.theta) == d.onset.value
     assert d.excess < 1.05
     # asked for by name, the answer is the same
     e = extend_stage(stage, (name,))
-    assert e.onset is not None and e.onset.value == pytest.approx(d.onset.value, abs=0.2) and e.excess < 1.05
+    assert e.onset is not None and e.onset.value == pytest.approx(d.onset.value) and e.excess < 1.05
     assert any(v.rule == BEGINS.name and v.holds for one in d.decisions for v in one.verdicts)
 
 

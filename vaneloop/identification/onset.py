@@ -145,45 +145,36 @@ def change_point(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> On
     """The onset with which the parameters of ``fit`` leave the least sum of squares, half-way between two samples, and
     its 90 % interval: all onsets that leave no more than `NINETY_ONSET` beyond it.
 
+    Before the onset the squares are those without effects, behind it those with them. In a window that an onset lies in
+    they are others: the onset is sought at the beginnings of windows, and then sample by sample in the windows next to
+    the best.
+
     correlation  samples of the error that count as one observation
     """
-    t, squares = judge.stage.t, _Squares(judge, fit)
-    low, high = 1, len(t) - 1
-    while True:
-        step = max(1, (high - low) // (MAX_SETS - 1))
-        best = squares.least(np.arange(low, high + 1, step))
-        if step == 1:
-            break
-        low, high = max(best - step, 1), min(best + step, len(t) - 1)
-    away = np.unique(np.geomspace(1.0, len(t), 2 * MAX_SETS).astype(int))
-    squares.least(np.clip(np.concatenate([best - away, best + away]), 1, len(t) - 1))
-    most = squares.of[best] + NINETY_ONSET * correlation
-    inside = [k for k, value in squares.of.items() if value <= most]
-    # an onset before sample k lies behind sample k - 1
-    first = max((k for k in squares.of if k < min(inside)), default=0)
-    last = min((k for k in squares.of if k > max(inside)), default=len(t))
-    return Onset(squares.time(best), float(t[first]), float(t[last - 1]))
+    stage, column = judge.stage, _column(judge.stage)
+    t, n = stage.t, len(stage.t)
 
+    def squares(onsets: Array) -> Array:
+        """float64[onsets, samples]"""
+        thetas = np.repeat(fit.theta[None], len(onsets), axis=0)
+        thetas[:, column] = onsets
+        return np.asarray(np.sum(judge.errors(thetas) ** 2, axis=1))
 
-class _Squares:
-    """Sums of squares of a fit's parameters with an onset before each of some samples; ``of``: by sample."""
-
-    def __init__(self, judge: LeastSquaresProblem, fit: Fit):
-        self.judge, self.fit, self.column = judge, fit, _column(judge.stage)
-        self.of: dict[int, float] = {}
-
-    def time(self, k: int) -> float:
-        """The time half-way between sample ``k`` and the one before, s."""
-        t = self.judge.stage.t
-        return float(0.5 * (t[k - 1] + t[k]))
-
-    def least(self, samples: Array) -> int:
-        """Of these samples and all that were tried before, the one with an onset before it that leaves least."""
-        new = [k for k in dict.fromkeys(samples.tolist()) if k not in self.of]
-        for i in range(0, len(new), MAX_SETS):
-            part = new[i : i + MAX_SETS]
-            thetas = np.repeat(self.fit.theta[None], len(part), axis=0)
-            thetas[:, self.column] = [self.time(k) for k in part]
-            left = self.judge.block_costs(self.judge.errors(thetas)).sum(axis=1)
-            self.of.update(zip(part, left.tolist(), strict=True))
-        return min(self.of, key=lambda k: self.of[k])
+    without, with_them = squares(np.array([t[-1] + 1.0, t[0]]))
+    left = np.cumsum(without)[:-1] + np.cumsum(with_them[::-1])[-2::-1]  # of an onset before sample 1, 2, ...
+    times = 0.5 * (t[1:] + t[:-1])
+    known = np.arange(n - 1)
+    if judge.window_start is not None:
+        begins = judge.window_start[judge.window_start > 0] - 1
+        k = int(np.argmin(left[begins]))
+        near = np.arange(begins[max(k - 1, 0)], begins[min(k + 1, len(begins) - 1)] + 1)
+        left[near] = np.concatenate(
+            [squares(x).sum(axis=1) for x in np.array_split(times[near], 1 + len(near) // MAX_SETS)]
+        )
+        known = np.union1d(begins, near)
+    best = known[np.argmin(left[known])]
+    inside = known[left[known] <= left[best] + NINETY_ONSET * correlation]
+    # an onset before sample k lies behind sample k - 1; the interval ends at the next onset that is ruled out
+    low = known[known < inside[0]].max(initial=-1) + 1
+    high = known[known > inside[-1]].min(initial=n - 1)
+    return Onset(float(times[best]), float(t[low]), float(t[high]))

@@ -138,7 +138,7 @@ def _confirm(
         steps.append((" + ".join(chosen), rms_of(judge, current)))
     out = criterion.conclude(nominal, current, effects, said.candidates, steps)
     if current.effects and begins is not None:
-        out.onset = change_point(judge, current, correlation_of(judge, current))
+        out.onset = replace(change_point(judge, current, correlation_of(judge, current)), value=begins)
     return out
 
 
@@ -203,7 +203,7 @@ def _whenever(
     if not said.final.effects and said.verdict != "unknown" or said.final.effects and agrees(said.excess, 1.0):
         return said
     at = quiet_until(LeastSquaresProblem(stage, said.floor, keep), lambda part, fit: judged(part).fails(fit))
-    for _ in range(ONSET_ROUNDS):
+    for k in range(ONSET_ROUNDS):
         if at is None:
             break
         last, later = at, begun(stage, at)
@@ -215,7 +215,7 @@ def _whenever(
             fit = LeastSquaresProblem(later, found.floor, keep).fit(tuple(found.nearest[:1]), later.neutral())
         correlation = correlation_of(judge, fit)
         when = change_point(judge, fit, correlation)
-        settled = when.low < at <= when.high
+        settled = when.value == at or (k > 0 and when.low < at <= when.high)  # the first is only a block's beginning
         for _ in range(0 if settled else ONSET_ROUNDS):
             if when.value == at:
                 break
@@ -228,7 +228,7 @@ def _whenever(
             case = Beginning(0.5 * float(always - begins) / correlation, judge.n_blocks)
             decisions = Decisions(found.decisions)
             if decisions.decide([BEGINS], case, found.final.effects, said.final.effects):
-                return replace(found, onset=when, decisions=list(decisions))
+                return replace(found, onset=replace(when, value=at), decisions=list(decisions))
         if at == last:
             break
     return said
