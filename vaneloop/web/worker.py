@@ -50,7 +50,7 @@ from vaneloop.pages.by_log import errors_by_log
 from vaneloop.pages.diagnosis import APART, diagnosis_page, errors_apart, located_tone
 from vaneloop.pages.fleet import fleet_page, log_page
 from vaneloop.pages.schedule import NAMES, schedule_page
-from vaneloop.pages.story import fall, since, word
+from vaneloop.pages.story import fall, word
 from vaneloop.verbs.learn import with_path
 from vaneloop.verbs.machine import Machine
 from vaneloop.verbs.parts import read_record, signals_of
@@ -219,7 +219,6 @@ def diagnose(progress: Progress, words: list[str]) -> dict[str, Any]:
         if n.found is not None:
             _, before, after = fall(n.found)
             names = " and ".join(f.effect for f in n.found.effects)
-            names = " ".join([names, since(n.found)]).strip()
             said = f"{n.found.stage} {word(n.found)}" + (f" {names}, {before} → {after} noise floors" if names else "")
             progress(None, {"found": said})
         progress(n.fraction, n.text)
