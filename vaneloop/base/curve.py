@@ -54,7 +54,7 @@ def on_even(x: float, low: float, per: float, table: np.ndarray) -> float:
 @compiled_free
 def on_even_grid(x: np.ndarray, grid: np.ndarray, table: np.ndarray) -> np.ndarray:
     """``np.interp(x, grid, table)`` to the last bit, of a ``grid`` that is even but for rounding: where a value stands
-    in it is reckoned, not searched.
+    in it is computed, not searched.
     """
     out, last = np.empty(len(x)), len(grid) - 1
     per = last / (grid[last] - grid[0])

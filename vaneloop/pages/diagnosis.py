@@ -25,6 +25,7 @@ from vaneloop.pages.story import (
     CANNOT,
     EXPLAINED,
     MISSING,
+    added,
     doubt,
     extended_sentence,
     fall,
@@ -298,7 +299,7 @@ def _told(
         )
     for s in d.stages:
         if s.effects and s.onset is not None:
-            page.text(f"{capital(s.stage)}: {' and '.join(f.effect for f in s.effects)} {since(s)}, not before.")
+            page.text(f"{capital(s.stage)}: {added(s)}, not before.")
     if by_log is not None:
         log_by_log(page, by_log)
         curves_by_log(page, by_log)

@@ -109,6 +109,11 @@ def since(s: StageDiagnosis) -> str:
     return f"from {value} s on [{low}, {high}]"
 
 
+def added(s: StageDiagnosis) -> str:
+    """The effects of a stage's model, and from when on they act."""
+    return f"{' and '.join(f.effect for f in s.effects) or 'the nominal model'} {since(s)}".rstrip()
+
+
 def doubt(f: Found) -> str:
     """What this log cannot tell about an effect; "": nothing."""
     out = []
@@ -126,9 +131,8 @@ def extended_sentence(d: Diagnosis, refused: str = "") -> str:
     parts = []
     for s in d.stages:
         _, before, after = fall(s)
-        names = " ".join([" and ".join(f.effect for f in s.effects) or "the nominal model", since(s)]).strip()
         end = EXPLAINED if reached(s) else "an error remains"
-        parts.append(f"with {names} the error of {together(s)} falls from {before} to {after} noise floors: {end}")
+        parts.append(f"with {added(s)} the error of {together(s)} falls from {before} to {after} noise floors: {end}")
     text = "; ".join(parts) or "nothing was extended"
     return f"{capital(text)}."
 

@@ -67,7 +67,8 @@ def diagnose_stage(
     second excerpt is taken from what is left.
     """
     if stage.excerpt is None or len(stage.t) < LONG_SAMPLES:
-        said = _whenever(stage, keep, judged, lambda later: _to_the_floor(later, floor, keep, tick, judged))
+        ask = partial(_to_the_floor, floor=floor, keep=keep, tick=tick, judged=judged)
+        said = _whenever(stage, keep, judged, ask)
         return _unless_coarse(stage, said)
     judge = LeastSquaresProblem(stage, floor, keep)
     at = excerpt_of(judge, None, EXCERPT_PIECE, EXCERPT_SAMPLES)
@@ -100,9 +101,8 @@ def _confirm(
     """Fit what an excerpt said to the whole log; an effect that the whole log does not need is dropped."""
     begins = onset_of(stage, said.final.theta)
     if begins is not None:
-        judge = LeastSquaresProblem(stage, said.floor, keep)
-        begins = change_point(judge, said.final, said.correlation).value
-        stage = begun(stage, begins)
+        begins = change_point(LeastSquaresProblem(stage, said.floor, keep), said.final, said.correlation).value
+    stage = begun(stage, begins)
     judge = LeastSquaresProblem(stage, said.floor, keep)
     criterion = judged(judge)
     nominal = base if np.array_equal(floor, said.floor) else judge.fit((), base.theta, 4)
@@ -200,7 +200,7 @@ def _whenever(
     does not up to some time, what it says of effects that begin then.
     """
     said = ask(stage)
-    if not said.final.effects and said.verdict != "unknown" or said.final.effects and agrees(said.excess, 1.0):
+    if agrees(said.excess, 1.0) if said.final.effects else said.verdict != "unknown":
         return said
     at = quiet_until(LeastSquaresProblem(stage, said.floor, keep), lambda part, fit: judged(part).fails(fit))
     for k in range(ONSET_ROUNDS):
@@ -367,7 +367,7 @@ def extend_stage(
                 f"subsystem {stage.name!r} has no effect {e!r}; it has {', '.join(x.name for x in stage.effects)}"
             )
 
-    return _whenever(stage, None, judged, lambda later: _extended(later, effects, tick, judged))
+    return _whenever(stage, None, judged, partial(_extended, effects=effects, tick=tick, judged=judged))
 
 
 def _extended(

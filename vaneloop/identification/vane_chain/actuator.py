@@ -73,11 +73,11 @@ def actuator_stage(driven: Driven) -> Stage:
         force = piston_stiction.scatter(np.gradient(without_jumps(stage, out[0])) * 1e-3 / dt, excess, speed)
         return np.hypot(between, 1e3 * give * float(np.sqrt(np.mean(force[np.isfinite(measured[0])] ** 2))))
 
-    moved = {"p_s": {"p_s": p_s + 1e6 * driven.assumed.get("p_s", 0.0)},
-             "t_oil": {"t_oil": t_oil + driven.assumed.get("t_oil", 0.0)}}  # fmt: skip
-    if unlogged := [moved[name] for name in moved if name in driven.assumed]:
-        as_assumed = simulate(stage.neutral()[None])[0]
-        stage.unlogged = np.array([simulate(stage.neutral()[None], **other)[0] - as_assumed for other in unlogged])
+    if assumed := driven.assumed:
+        moved = {"p_s": p_s + 1e6 * assumed.get("p_s", 0.0), "t_oil": t_oil + assumed.get("t_oil", 0.0)}
+        neutral = stage.neutral()[None]
+        as_assumed = simulate(neutral)[0]
+        stage.unlogged = np.array([simulate(neutral, **{c: moved[c]})[0] - as_assumed for c in moved if c in assumed])
     stage.raster_error = np.array([SIMPLER[machine.kind]])
     if others is not i:
         stage.hidden = hidden
