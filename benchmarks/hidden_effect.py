@@ -316,7 +316,7 @@ def judge_case(
         run = rig.simulate(
             test, firmware(), hidden, seed=case["machine_seed"], rate=1000 if logger else rate,
             geometry=case["geometry"],
-            gaps=case["gaps"],
+            gaps=() if logger else case["gaps"],
             spells=case["modes"],
             motor=motor,
         )  # fmt: skip
@@ -325,7 +325,7 @@ def judge_case(
             without = ("t", "p_s") if motor else ("t",)  # there is no oil
             log = {k: v for k, v in run.log.items() if k not in without}
             channels = (
-                recorded(log, logger, np.random.default_rng([seed, index, 2]))
+                recorded(log, logger, np.random.default_rng([seed, index, 2]), case["gaps"])
                 if logger
                 else {k: Channel(run.log["t"], v) for k, v in log.items()}
             )

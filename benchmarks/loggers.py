@@ -8,7 +8,7 @@ without channels that nobody wired.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,13 +82,21 @@ def draw(rng: np.random.Generator, kinds: tuple[str, ...] = KINDS) -> Logger:
     return Logger(rate, **{k: v for k, v in whole.items() if k in does})
 
 
-def recorded(log: Mapping[str, np.ndarray], logger: Logger, rng: np.random.Generator) -> dict[str, Channel]:
-    """What ``logger`` writes of a log with a row each 1 ms: channel -> its samples."""
+def recorded(
+    log: Mapping[str, np.ndarray], logger: Logger, rng: np.random.Generator, gaps: Sequence[tuple[float, float]] = ()
+) -> dict[str, Channel]:
+    """What ``logger`` writes of a log with a row each 1 ms: channel -> its samples.
+
+    gaps  (start, length), s: stretches whose rows it loses
+    """
     t = np.arange(len(next(iter(log.values())))) * FINE
     step = 1.0 / logger.rate
     at = np.arange(round(0.05 / FINE), len(t) - round(0.05 / FINE), round(step / FINE))
     group = {c: g for g, names in GROUPS.items() for c in names}
     stale = _stale(len(at), *logger.stale, rng)
+    kept = np.ones(len(at), dtype=bool)
+    for start, length in gaps:
+        kept &= (t[at] < start) | (t[at] >= start + length)
     out = {}
     for name, values in log.items():
         if name == "t" or name in logger.missing:
@@ -109,7 +117,7 @@ def recorded(log: Mapping[str, np.ndarray], logger: Logger, rng: np.random.Gener
         if logger.resolution and name in RESOLUTIONS:
             d = logger.resolution * RESOLUTIONS[name]
             v = np.round(v / d) * d
-        out[name] = Channel(t[at], v[stale])
+        out[name] = Channel(t[at][kept], v[stale][kept])
     return out
 
 

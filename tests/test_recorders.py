@@ -225,3 +225,14 @@ def test_what_a_last_digit_hides_is_one_error_as_long_as_it_stands():
     stands = _other_noise(t, x, 1)[0].reshape(400, 100).mean(axis=1)  # what else is in it is white
     assert np.std(stands) == pytest.approx(0.05 / 12.0**0.5, rel=0.1)
     assert np.abs(np.corrcoef(stands[1:], stands[:-1])[0, 1]) < 0.15
+
+
+@pytest.mark.parametrize("kept", [Logger(100), Logger(50, offset={"vanes": 0.02}, window=0.02)])
+def test_rows_that_a_recorder_loses_leave_the_others_where_they_were(kept: Logger):
+    log = {"t": np.arange(5000) * 1e-3, "vigv": np.arange(5000) * 1e-3, "p_s": np.full(5000, 21.0)}
+    whole, lost = (recorded(log, kept, np.random.default_rng(0), gaps) for gaps in ((), ((1.0, 0.5), (3.0, 1.0))))
+    for name, c in lost.items():
+        there = np.isin(whole[name].t, c.t)
+        assert np.array_equal(c.values, whole[name].values[there])
+        gone = whole[name].t[~there]
+        assert np.all((gone >= 1.0) & (gone < 1.5) | (gone >= 3.0) & (gone < 4.0)) and len(gone) == 1.5 * kept.rate

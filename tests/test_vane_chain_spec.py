@@ -23,6 +23,7 @@ from plant.stages.linkage import speed_reach
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.settings import COLOUR
 from vaneloop.identification.subsystem import Array, Parameter, Stage
 from vaneloop.identification.unmodelled.regressors import Quantity
 from vaneloop.identification.user_models.terms import COLUMN
@@ -38,6 +39,8 @@ from vaneloop.identification.vane_chain.alignment import (
     driving,
     late_in_controller,
     late_vanes,
+    on_rows,
+    vanes_late,
 )
 from vaneloop.identification.vane_chain.candidates import (
     LAGGED,
@@ -108,7 +111,7 @@ from vaneloop.identification.vane_chain.resample import (
     stretches,
 )
 from vaneloop.identification.vane_chain.servo import servo_stage
-from vaneloop.identification.vane_chain.subsystem_data import Driven
+from vaneloop.identification.vane_chain.subsystem_data import VANES_LATE, Driven
 
 CALIBRATION = load_calibration()
 LATE, TICK = 0.04, 1e-3  # s
@@ -261,9 +264,18 @@ def test_a_late_channel_is_put_where_it_belongs() -> None:
     assert late.text() == "vigv, vgv1: stand 20 ms late in the file, and 100 us more each second; moved"
     assert Late(("n_r",), -0.005).text() == "n_r: stand 5 ms early in the file; moved"
     assert late.times(t) == pytest.approx(t - 0.02 - 1e-4 * (t - 50.0))
-    log = log_of(7.0 + t, vigv=t, n_r=t)
-    moved = aligned(log, [late, Late(("n_r",), 0.5)], 7.0)
-    assert moved["vigv"].t == pytest.approx(7.0 + late.times(t)) and moved["n_r"].t is log["n_r"].t
+    log = log_of(n_r=(7.0 + t, t), x_lvdt=(7.0 + t, 0.1 * t), vigv=(7.3 + t, t))
+    grid = Grid(7.0, 1.0, 91, {}, {})
+    moved = aligned(log, [late, Late(("n_r",), 0.5), late._replace(channels=("x_lvdt",))], grid)
+    assert moved["x_lvdt"].t == pytest.approx(7.0 + late.times(t)) and moved["n_r"].t is log["n_r"].t
+    assert moved["vigv"].t == pytest.approx(7.0 + t)  # angles go to the rows, and the model of them to the angles
+    assert on_rows(log, late, grid) == pytest.approx(0.3)
+    rows = np.arange(100.0)
+    left = vanes_late(rows, [late], log, grid)[VANES_LATE]
+    assert left == pytest.approx(0.02 + 1e-4 * (rows - 50.0) - 0.3)
+    assert vanes_late(rows, [Late(("n_r",), 0.5), Late(("vigv",), 0.0)], log, grid) == {}
+    fast = log_of(n_r=(7.0 + 0.01 * rows, rows), vigv=(7.002 + 0.005 * rows, rows))
+    assert on_rows(fast, late, grid._replace(dt=0.01)) == pytest.approx(0.002)
     here = {"vigv": t, "n_r": 3.0 * t}
     moved_here = driving(t, here, [late, Late(("n_r",), 0.5)])
     assert moved_here["n_r"][:-1] == pytest.approx(3.0 * (t + 0.5)[:-1])
@@ -275,13 +287,22 @@ def test_a_late_channel_is_put_where_it_belongs() -> None:
     ("before", "after", "explains"),
     [
         ([5.0, 3.0], [2.9, 2.0], True), ([5.0, 3.0], [3.1, 2.0], False), ([5.0, 3.0], [1.0, 3.1], False),
-        ([5.0, 0.5], [1.0, 0.5], True), ([5.0], [3.0], True), ([1.0], [1.0], True),
+        ([5.0, 0.5], [1.0, 0.5], True), ([5.0], [3.0], True), ([1.0], [1.0], False),
     ],
 )  # fmt: skip
 def test_a_clock_explains_what_gets_better_everywhere_and_by_half(
-    before: list[float], after: list[float], explains: bool
+    chain: Chain, before: list[float], after: list[float], explains: bool
 ) -> None:
-    assert _explains(np.array(before), np.array(after)) == explains
+    stage = chain.stage("linkage")
+    assert _explains(stage, np.array([*before, 1.0, 1.0])[:3], np.array([*after, 1.0, 1.0])[:3]) == explains
+
+
+def test_a_clock_must_gain_as_many_nats_as_an_effect(chain: Chain) -> None:
+    stage = chain.stage("linkage")
+    per_output = np.isfinite(stage.measured).sum(axis=1)
+    enough = 2.0 * COLOUR[1] * NATS / per_output.sum()
+    fits = np.full(3, 0.9)  # below the floor, whose level is no evidence
+    assert _explains(stage, fits, fits - 1.01 * enough) and not _explains(stage, fits, fits - 0.99 * enough)
 
 
 # ---- the current between rows ----------------------------------------------------------------------------------------

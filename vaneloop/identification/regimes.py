@@ -7,7 +7,7 @@ own models draw it.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -20,7 +20,7 @@ from vaneloop.identification.settings import AGREES, COLOUR, RASTER_KNOWN_TO, RE
 from vaneloop.identification.subsystem import Array, without_jumps
 
 __all__ = [
-    "Located", "Regime", "Shape", "StageFigures", "agrees", "locate", "onset", "regimes", "shape",
+    "Bins", "Located", "Regime", "Shape", "StageFigures", "agrees", "bins_of", "locate", "onset", "regimes", "shape",
     "stands_out", "steady",
 ]  # fmt: skip
 
@@ -224,6 +224,43 @@ def _edges(values: Array) -> Array:
     return edges
 
 
+class Bins(NamedTuple):
+    """The samples of one output by bins of a condition and blocks of the log.
+
+    edges   of the bins, bins + 1
+    use     bool[samples]: those that count
+    bin_of  of each of these
+    block_of  of each of these; ``blocks``: how many there are
+    """
+
+    edges: Array
+    use: Array
+    bin_of: Array
+    block_of: Array
+    blocks: int
+
+    @property
+    def many(self) -> int:
+        """Number of bins."""
+        return len(self.edges) - 1
+
+    def sums(self, values: Array) -> Array:
+        """Sums of values, float64[samples], in each bin and block, float64[bins, blocks]."""
+        cell = self.bin_of * self.blocks + self.block_of
+        return np.bincount(cell, values[self.use], minlength=self.many * self.blocks).reshape(self.many, self.blocks)
+
+
+def bins_of(judge: LeastSquaresProblem, output: int, values: Array) -> Bins | None:
+    """Bins of a condition's values, float64[samples], for an output; None where they say nothing."""
+    use = judge.valid[output] & np.isfinite(values)
+    if use.sum() < 100 or np.ptp(values[use]) == 0.0:
+        return None
+    edges = _edges(values[use])
+    blocks = len(judge.block_start)
+    block_of = np.repeat(np.arange(blocks), np.diff(judge.block_start, append=len(use)))[use]
+    return Bins(edges, use, np.clip(np.digitize(values[use], edges) - 1, 0, len(edges) - 2), block_of, blocks)
+
+
 def regimes(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> list[Regime]:
     """Error of every output against every condition of the stage, most telling first.
 
@@ -235,24 +272,16 @@ def regimes(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> list[Re
     raster = np.zeros(len(stage.outputs)) if stage.raster_error is None else (stage.raster_error / judge.floor) ** 2
     known = 1.0 + np.minimum(raster, 1.0) * ((1.0 + RASTER_KNOWN_TO) ** 2 - 1.0)
     raw = []
-    looks, blocks = 0, len(judge.block_start)
-    block_of = np.repeat(np.arange(blocks), np.diff(judge.block_start, append=e.shape[1]))
+    looks = 0
     for k, output in enumerate(stage.outputs):
-        valid = judge.valid[k]
         for name, values in stage.regimes.items():
-            use = valid & np.isfinite(values)
-            if use.sum() < 100 or np.ptp(values[use]) == 0.0:
+            bins = bins_of(judge, k, values)
+            if bins is None:
                 continue
-            edges = _edges(values[use])
-            bin_of = np.clip(np.digitize(values[use], edges) - 1, 0, len(edges) - 2)
-            many, cell = len(edges) - 1, bin_of * blocks + block_of[use]
-            n, square, floor = (
-                np.bincount(cell, x, minlength=many * blocks).reshape(many, blocks)
-                for x in (np.ones(len(cell)), e[k, use] ** 2, lost[k, use])
-            )
-            looks += many
-            moments = _greatest(bin_of, np.abs(e[k, use]), stage.t[use], many)
-            raw.append((k, output, name, edges, (n, square, floor), moments))
+            looks += bins.many
+            sums = bins.sums(np.ones(e.shape[1])), bins.sums(e[k] ** 2), bins.sums(lost[k])
+            moments = _greatest(bins.bin_of, np.abs(e[k, bins.use]), stage.t[bins.use], bins.many)
+            raw.append((k, output, name, bins.edges, sums, moments))
     out = []
     for k, output, name, edges, sums, moments in raw:
         # what all other bins have, too, is no matter of this one, as far as the floor may be wrong

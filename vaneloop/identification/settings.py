@@ -1493,6 +1493,36 @@ OTHER_CURRENT = setting(
     "A logged current is another kind of sample than the mean since the row before where it misfits by this much less.",
     "judgement: clearly better, while both hold the same noise",
 )
+NOISE_ALIKE = setting(
+    0.5,
+    "share",
+    "An error is noise where its mean square under every condition is as expected within this share of its excess.",
+    "judgement: physics that is missing shows little of its error somewhere: at rest, in one direction, at low speed",
+)
+NOISE_BY_CHANCE = setting(
+    0.05,
+    "share",
+    "Such a share of the bins may be out of it by more than two standard deviations.",
+    "principle: by chance one in twenty is",
+)
+QUIET_KNOWN_TO = setting(
+    1.5,
+    "times",
+    "The noise of an output may be so many times how it moves in its quietest windows.",
+    "principle: a tenth quantile of few windows of coloured noise is known to a third",
+)
+NOISE_WINDOW = setting(
+    4.0,
+    "s",
+    "The spectrum of a channel's noise is taken of windows of this length.",
+    "principle: noise that is slower has no place in it",
+)
+LOW_PASS_ROWS = setting(
+    (0.3, 0.6, 1.0, 1.6),
+    "rows",
+    "Delays from which the low-pass of a slow recorder is sought.",
+    "numerics: anti-alias filters of a tenth to a half of the rate, each within reach of the next",
+)
 LOW_PASS_LASTS = setting(12.0, "delays", "After so many a low-pass has forgotten a value.", "principle: to a millionth")
 ROW_PARTS = setting(
     50, "parts", "A low-pass is worked out in so many parts of a row.", "principle: its error is below 1 %"
@@ -1500,7 +1530,7 @@ ROW_PARTS = setting(
 NOISE_DRAWS = setting(
     4,
     "draws",
-    "So many tell how much of the noise behind a low-pass a noise floor shows.",
+    "So many tell how much of the noise behind a low-pass a noise floor shows, and what noise does to a subsystem.",
     "budget of work: the draws differ by some per cent",
 )
 MOVES_ALIKE = setting(

@@ -23,14 +23,20 @@ import numpy as np
 
 from hil.logs import Log
 from plant import chain
+from vaneloop.base.vanes import VANES
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
-from vaneloop.identification.settings import AGREES, EXPLAINED, LATE, MOVES_ALIKE, RASTER, WINDOW
+from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
+from vaneloop.identification.settings import COLOUR, EXPLAINED, LATE, LOW_PASS_ROWS, MOVES_ALIKE, NATS, RASTER, WINDOW
 from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.vane_chain.current import law_of
 from vaneloop.identification.vane_chain.low_pass import AS_LOGGED, LOW_PASSES, LowPass
-from vaneloop.identification.vane_chain.subsystem_data import Made
+from vaneloop.identification.vane_chain.resample import Grid, first_row
+from vaneloop.identification.vane_chain.subsystem_data import VANES_LATE, Made
 
-__all__ = ["Late", "LateIn", "aligned", "demand_of", "driving", "late_in_controller", "late_vanes", "passed_by"]
+__all__ = [
+    "Late", "LateIn", "aligned", "demand_of", "driving", "late_in_controller", "late_vanes", "on_rows", "passed_by",
+    "vanes_late",
+]  # fmt: skip
 
 Both = tuple[Array, Array]  # the mean of a row's ticks, and the last of them
 LateIn = Mapping[str, tuple["Late", ...]]  # subsystem -> what stands late in it, against what it explains
@@ -71,17 +77,26 @@ class Late(NamedTuple):
         return np.asarray(t - self.seconds - self.drift * (t - self.middle))
 
 
-def aligned(log: Log, late: Sequence[Late], start: float) -> Log:
-    """The log with its strokes and angles where they belong; ``start``: s of its own time, where that of its stages is
-    0.
-    """
+def aligned(log: Log, late: Sequence[Late], grid: Grid) -> Log:
+    """The log with its strokes where they belong, and the vane angles `on_rows` of its raster."""
     late = [one for one in late if one.seconds or one.drift]
-    moved = {name: one for one in late for name in one.channels if name in log.channels and name not in DRIVING}
     channels = dict(log.channels)
-    for name, one in moved.items():
-        c = channels[name]
-        channels[name] = replace(c, t=start + one.times(c.t - start))
-    return replace(log, channels=channels) if moved else log
+    for one in late:
+        for name in (c for c in one.channels if c in log.channels and c not in DRIVING):
+            c = channels[name]
+            moved = grid.start + one.times(c.t - grid.start)
+            channels[name] = replace(c, t=c.t - on_rows(log, one, grid) if name in VANES else moved)
+    return replace(log, channels=channels) if late else log
+
+
+def on_rows(log: Log, late: Late, grid: Grid) -> float:
+    """Seconds by which the samples of channels that stand late lie behind rows of the raster, at most half a row: noise
+    between two rows is less than it is at them, and the floor with it.
+    """
+    c = next(log.channels[name] for name in late.channels if name in log.channels)
+    step = min(grid.dt, float(np.median(np.diff(c.t))))
+    turns = np.exp(2j * np.pi * (c.t - first_row(log.channels, grid)) / step)
+    return float(np.angle(np.mean(turns))) * step / (2.0 * np.pi)
 
 
 def driving(t: Array, columns: dict[str, Array], late: Sequence[Late]) -> dict[str, Array]:
@@ -90,6 +105,14 @@ def driving(t: Array, columns: dict[str, Array], late: Sequence[Late]) -> dict[s
     """
     moved = {name: one for one in late for name in one.channels if name in columns and name in DRIVING}
     return columns | {name: _shifted(t, columns[name], one.besides) for name, one in moved.items()}
+
+
+def vanes_late(t: Array, late: Sequence[Late], log: Log, grid: Grid) -> dict[str, Array]:
+    """By how much the vane angles stand late at the rows ``t`` (s) where `aligned` has left them: a column `VANES_LATE`
+    (s), or none. The model of them is made for where they were.
+    """
+    moved = next((one for one in late if not {*VANES}.isdisjoint(one.channels) and (one.seconds or one.drift)), None)
+    return {VANES_LATE: t - moved.times(t) - on_rows(log, moved, grid)} if moved else {}
 
 
 def demand_of(late: Sequence[Late]) -> tuple[LowPass, tuple[Late, ...]]:
@@ -120,6 +143,8 @@ def late_in_controller(stages: Sequence[Stage]) -> LateIn:
         out["demand"] = _one(of["demand"], ("n_r",), lambda d: d > -demand_late - LEAST_LATE * (demand_late > 0.0))
     passed, _ = demand_of(out.get("servo", ()))
     passed = passed._replace(late=0.0)
+    if "servo" not in of and "linkage" in of:
+        passed = _both_passed(of["linkage"])
     if "engine" in of:
         out["engine"] = _one(of["engine"], ("n_dem",), lambda d: True, passed)
     if passed.kind and "linkage" in of:
@@ -144,7 +169,7 @@ def late_vanes(stages: Sequence[Stage]) -> LateIn:
         return {name: _shifted(t, c[name], d) for name in ("x_lvdt", "stroke", "n_r") if name in c}
 
     late, before, after = _fit(stage, _moving(stage, shifted), 2)
-    if not _explains(before, after) or np.any(np.abs(late) >= LATE):
+    if not _explains(stage, before, after) or np.any(np.abs(late) >= LATE):
         return {}
     if late[0] < 0.0 and "actuator" in of and not _fits(of["actuator"]):
         return {}
@@ -246,13 +271,22 @@ def _low_pass(kind: str, delay: float, errors: Callable[[LowPass], Array]) -> tu
     return min(found)
 
 
-def _fit(stage: Stage, moved: Callable[[Array], Stage], terms: int, frame: float = 0.0) -> tuple[Array, Array, Array]:
+def _fit(
+    stage: Stage,
+    moved: Callable[[Array], Stage],
+    terms: int,
+    frame: float = 0.0,
+    start: Array | None = None,
+    most: float | Array = LATE,
+) -> tuple[Array, Array, Array]:
     """Offsets (s, float64[terms]) that suit a stage best with its nominal parameters, and its outputs' mean squared
     errors without and with them, in noise floors.
+
+    start, most  offsets to begin with, and how large they may be
     """
     floor = np.asarray(stage.floor)
     judge = LeastSquaresProblem(stage, floor)
-    theta, late = recalibrate(judge).theta, np.zeros(terms)
+    theta, late = recalibrate(judge).theta, np.zeros(terms) if start is None else start
     free = [i for i, p in enumerate(stage.parameters) if p.tolerance > 0.0]
     sizes = np.array([0.05 * stage.parameters[i].tolerance for i in free])
     before = _mean_squares(judge, theta)
@@ -272,11 +306,12 @@ def _fit(stage: Stage, moved: Callable[[Array], Stage], terms: int, frame: float
         prior = np.diag([*[3.0**0.5] * len(free), *[0.0] * terms])
         held = np.array([*((theta[i] - stage.parameters[i].expected) / stage.parameters[i].tolerance for i in free),
                          *[0.0] * terms])  # fmt: skip
-        step = np.linalg.lstsq(np.vstack([a, prior]), -np.concatenate([e[0].ravel(), prior @ held]), rcond=None)[0]
+        normal, slope = a.T @ a + prior**2, a.T @ e[0].ravel() + prior**2 @ held
+        step = np.linalg.lstsq(normal, -slope, rcond=None)[0]
         step *= scale
         theta = theta.copy()
         theta[free] += step[: len(free)]
-        late = np.clip(late + step[len(free) :], -LATE, LATE)
+        late = np.clip(late + step[len(free) :], -most, most)
     offsets = [late]
     if frame:  # what comes in frames stands late by whole ones
         offsets.append(np.round(late / frame) * frame)
@@ -291,10 +326,19 @@ def _mean_squares(judge: LeastSquaresProblem, theta: Array) -> Array:
     return np.asarray(np.sum(e * e, axis=1) / np.maximum(judge.valid.sum(axis=1), 1))
 
 
-def _explains(before: Array, after: Array) -> bool:
-    """Whether every output that fails gets better, and together by at least half of what they are above the noise."""
+def _explains(stage: Stage, before: Array, after: Array) -> bool:
+    """Whether no output gets worse, the gain is significant, and at least half of what they are above the noise goes;
+    ``before`` and ``after``: mean squared errors of the outputs, in squared noise floors.
+    """
     excess, left = np.maximum(before - 1.0, 0.0), np.maximum(after - 1.0, 0.0)
-    return bool(np.all(after <= before * 1.0001) and left.sum() <= (1.0 - EXPLAINED) * excess.sum())
+    better = bool(np.all(after <= before * 1.0001)) and _significant(stage, before, after)
+    return better and bool(left.sum() <= (1.0 - EXPLAINED) * excess.sum())
+
+
+def _significant(stage: Stage, before: Array, after: Array) -> bool:
+    """Whether errors have become less by as many nats as an effect must gain."""
+    samples = np.isfinite(stage.measured).sum(axis=1)
+    return float((before - after) @ samples) > 2.0 * COLOUR[1] * NATS
 
 
 def _moving(
@@ -328,7 +372,7 @@ def _one(
     found = []
     for behind in dict.fromkeys((AS_LOGGED, passed, passed._replace(held=bool(passed.kind)))):
         late, before, after = _fit(stage, _moving(stage, of, behind), 1, RASTER)
-        if _explains(before, after) and allowed(float(late[0])) and abs(late[0]) < LATE:
+        if _explains(stage, before, after) and allowed(float(late[0])) and abs(late[0]) < LATE:
             one = Late(channels, float(late[0]) - behind.delay, passed=behind._replace(late=-float(late[0])))
             found.append((float(after.sum()), one if behind.kind else Late(channels, float(late[0]))))
     return (min(found, key=lambda x: x[0])[1],) if found else ()
@@ -342,6 +386,38 @@ def _both_behind(stage: Stage, passed: LowPass) -> tuple[Late, ...]:
     return (Late(("x_lvdt", *stage.outputs), 0.0, passed=passed),) if after.sum() < before.sum() else ()
 
 
+def _both_passed(stage: Stage) -> LowPass:
+    """The low-pass that stroke and vanes have both passed, where no servo tells: what it takes off the stroke's turns
+    the play keeps, which no offset does.
+    """
+    if _fits(stage):
+        return AS_LOGGED
+    t, c = stage.t, stage.made.driven.columns  # type: ignore[attr-defined]
+    dt = float(t[1] - t[0])
+    stroke = c.get("stroke", c["x_lvdt"])
+
+    def behind(kind: str, start: float, fixed: bool) -> tuple[float, LowPass, Array]:
+        """What a low-pass leaves whose delay is ``start`` (s), or the one near it that suits best; the low-pass; and
+        what it leaves of each output.
+        """
+
+        def passed(late: Array) -> LowPass:
+            return LowPass(kind, start if fixed else abs(float(late[1]))) if kind else AS_LOGGED
+
+        def moved(late: Array) -> Stage:
+            before = _shifted(t, passed(late).before(stroke, dt), -late[0])
+            return _moving(stage, lambda _: {"stroke": before}, passed(late))(late)
+
+        begin, most = (np.array(x)[: 1 if fixed else 2] for x in ([0.0, start], [LATE, np.inf]))
+        late, _, after = _fit(stage, moved, len(begin), start=begin, most=most)
+        return float(after.sum()), passed(late), after
+
+    scanned = min((behind("second order", rows * dt, True) for rows in LOW_PASS_ROWS), key=lambda x: x[0])[1].delay
+    _, passed, left = min((behind(kind, scanned, False) for kind in LOW_PASSES), key=lambda x: x[0])
+    return passed if _significant(stage, behind("", 0.0, True)[2], left) else AS_LOGGED
+
+
 def _fits(stage: Stage) -> bool:
+    """Whether no search would begin."""
     judge = LeastSquaresProblem(stage, np.asarray(stage.floor))
-    return bool(np.all(_mean_squares(judge, recalibrate(judge).theta) <= AGREES**2))
+    return not LikelihoodAcceptance(judge).fails(recalibrate(judge))

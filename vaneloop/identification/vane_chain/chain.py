@@ -57,6 +57,7 @@ from vaneloop.identification.vane_chain.alignment import (
     late_in_controller,
     late_vanes,
     passed_by,
+    vanes_late,
 )
 from vaneloop.identification.vane_chain.candidates import OF_STROKE, reversals, room_for
 from vaneloop.identification.vane_chain.current import (
@@ -84,6 +85,7 @@ from vaneloop.identification.vane_chain.resample import (
     stretches,
 )
 from vaneloop.identification.vane_chain.servo import servo_stage
+from vaneloop.identification.vane_chain.stationary_noise import expect_stationary_noise
 from vaneloop.identification.vane_chain.subsystem_data import SAMPLED_OF, Driven
 
 __all__ = ["STAGE_ORDER", "Chain", "build_chain"]
@@ -153,15 +155,33 @@ def build_chain(
     late     what stands late in the log, where that is known; None: it is to be found
     """
     known = late or {}
-    chain = _build(log, plant, calibration, present, grid, pieces, draws, known)
     framed = any(c.framed for c in log.channels.values())  # frames are stamped by one clock
+    chain = _build(log, plant, calibration, present, grid, pieces, draws, known)
+    noisy = expect_stationary_noise(chain.stages) if late is not None or framed else []
     for find in () if late is not None or framed else (late_in_controller, late_vanes):
-        if found := find(chain.stages):
+        found = find(chain.stages)
+        if found:
             known = {**known, **{name: known.get(name, ()) + more for name, more in found.items()}}
+            hidden = {s.name: s.raster_error for s in chain.stages}
             chain = _build(log, plant, calibration, present, grid, pieces, draws, known)
-    chain.notes += _moved(known)
+            for stage in chain.stages:
+                _hides_no_less(stage, hidden.get(stage.name))
+        if found or find is late_in_controller:
+            noisy = expect_stationary_noise(chain.stages)
+    chain.notes += _moved(known) + noisy
     chain.late = known
     return chain
+
+
+def _hides_no_less(stage: Stage, error: Array | None) -> None:
+    """Have a slow log's stage whose channels were moved expect what its rows hid before: straight lines between them
+    look smoother, and hide the same.
+    """
+    if error is None or stage.raster_error is None or stage.t[1] - stage.t[0] < 1.5 * RASTER:
+        return
+    if np.any(error > stage.raster_error):
+        stage.raster_error = np.maximum(error, stage.raster_error)
+        stage.floor = noise_of(stage, stage.neutral())
 
 
 def _moved(late: LateIn) -> list[Note]:
@@ -265,7 +285,7 @@ def _chain(
     """
     behind, late = demand_of(late)
     passed = passed_by(late)
-    log = aligned(log, late, grid.start)
+    as_filed, log = log, aligned(log, late, grid)
     cal = flashed(tables, machine)
     theirs = tables.program is not None  # a controller of the user's own: its servo's law is not known
     low, high = grid.rows_of(names[0]) if names else (0, grid.rows)
@@ -280,7 +300,7 @@ def _chain(
             f"search for missing physics"
         )
     dt = float(t[1] - t[0])
-    columns = driving(t, columns, late)
+    columns = driving(t, columns, late) | vanes_late(t, late, as_filed, grid)
     running = np.round(columns["state"]) == RUN if "state" in columns else None
     mostly, share = True, 1.0
     if running is not None:
@@ -398,7 +418,8 @@ def _chain(
             # a corner of an input between two rows costs about as much as the corners that the doubled raster loses
             # besides
             coarse = make(driven.at(slice(None, None, 2), every_other(have, coarse_current), rows[::2]))
-            more = rms(coarse, stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0])
+            lost = stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0]
+            more, stage.lost = rms(coarse, lost), lost.repeat(2, axis=1)[None, :, : len(t)]
             stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
         if (apart := max(round(log.channels[c].apart / dt) for c in needs)) > 1:
             more = np.zeros(len(outputs))

@@ -12,7 +12,7 @@ from vaneloop.identification.settings import SETTLE, WINDOW
 from vaneloop.identification.subsystem import Array, Named, Stage
 from vaneloop.identification.vane_chain.parameters import declared, lanes, like_temperature, like_time
 from vaneloop.identification.vane_chain.resample import pieces_of, since
-from vaneloop.identification.vane_chain.subsystem_data import Driven, Made, excerpts
+from vaneloop.identification.vane_chain.subsystem_data import VANES_LATE, Driven, Made, excerpts
 
 __all__ = ["linkage_stage"]
 
@@ -27,6 +27,7 @@ def linkage_stage(driven: Driven) -> Stage:
     x = np.ascontiguousarray(c.get("stroke", c["x_lvdt"]) * 1e-3)
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
     t_oil = np.ascontiguousarray(c["t_oil"])
+    late = c.get(VANES_LATE)
     which = [machine.vanes.index(o) for o in outputs]
     begun = [o in c and bool(driven.sampled(o)[: round(WINDOW / dt)].any()) for o in machine.vanes]
     first = [np.deg2rad(np.median(c[o][:5])) if b else np.nan for o, b in zip(machine.vanes, begun, strict=True)]
@@ -40,7 +41,8 @@ def linkage_stage(driven: Driven) -> Stage:
         out = np.empty((len(thetas), len(first), len(t)))
         linkage_run(x, n_r, t_oil, t, dt, p, s, out.transpose(2, 1, 0), driven.slipping(signals, p))
         out = out if which == list(range(len(first))) else out[:, which]
-        return driven.passed.of_rows(np.rad2deg(out, out=out), dt)
+        out = driven.passed.of_rows(np.rad2deg(out, out=out), dt)
+        return out if late is None else _earlier(out, late / dt)
 
     # until the stroke has crossed the play twice over, nobody knows where in it the rings started; nor where they were
     # left at full speed by a controller that had to catch up, which turns between two rows
@@ -76,6 +78,14 @@ def linkage_stage(driven: Driven) -> Stage:
     stage.counted = kept
     stage.excerpt, stage.made = excerpts(linkage_stage, driven, stage, kept), Made(linkage_stage, driven)
     return stage
+
+
+def _earlier(values: Array, rows: Array) -> Array:
+    """The ``values``, float64[..., samples], each so many ``rows``, float64[samples], before, by straight lines."""
+    at = np.clip(np.arange(values.shape[-1]) - rows, 0.0, values.shape[-1] - 1.0)
+    before = np.minimum(at.astype(int), values.shape[-1] - 2)
+    share = at - before
+    return np.asarray(values[..., before] * (1.0 - share) + values[..., before + 1] * share)
 
 
 def _crossed(x: Array) -> Array:

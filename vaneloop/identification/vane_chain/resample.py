@@ -28,6 +28,7 @@ __all__ = [
     "Grid",
     "OfSubsystem",
     "every_other",
+    "first_row",
     "grid_of",
     "lately",
     "no_gap_in_window",
@@ -194,16 +195,21 @@ def _between(c: Channel, low: float, high: float) -> Channel:
     return Channel(c.t[use], c.values[use], c.framed)
 
 
+def first_row(channels: Mapping[str, Channel], grid: Grid) -> float:
+    """Time of row 0 in the log's own time, s: rows stand where the samples of the controller do."""
+    reference = answers(channels) or max((c for c in channels.values()), key=lambda c: len(c.t))
+    own = float(np.median(np.diff(reference.t)))
+    own = grid.dt if abs(own - grid.dt) < 0.02 * grid.dt else own  # a jitter's median would add up over the log
+    if own < 0.5 * grid.dt:
+        return grid.start
+    return grid.start + float(np.median((reference.t - grid.start + 0.5 * own) % own) - 0.5 * own)
+
+
 def _columns(
     channels: Mapping[str, Channel], grid: Grid, t: Array
 ) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array]]:
     """`on_raster` at rows ``t`` (s from its start): channels, and of those with gaps what `Gaps` says of them."""
-    dt, first = grid.dt, grid.start
-    reference = answers(channels) or max((c for c in channels.values()), key=lambda c: len(c.t))
-    own = float(np.median(np.diff(reference.t)))
-    own = dt if abs(own - dt) < 0.02 * dt else own  # a jitter's median would add up over the log
-    phase = float(np.median((reference.t - first + 0.5 * own) % own) - 0.5 * own) if own >= 0.5 * dt else 0.0
-    when = t + first + phase
+    dt, when = grid.dt, t + first_row(channels, grid)
     had = taken(channels, when, 0.5 * dt)
     columns, far, missing = {}, dict[str, Array](), dict[str, Array]()
     row = np.rint(t / dt)

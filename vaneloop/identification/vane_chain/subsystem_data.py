@@ -23,9 +23,10 @@ from vaneloop.identification.user_models.motion import smoothed
 from vaneloop.identification.user_models.simulation import Placed
 from vaneloop.identification.vane_chain.low_pass import AS_LOGGED, LowPass
 
-__all__ = ["SAMPLED_OF", "Driven", "Made", "excerpts"]
+__all__ = ["SAMPLED_OF", "VANES_LATE", "Driven", "Made", "excerpts"]
 
 SAMPLED_OF = "sampled "  # and an output's name: a column that is 1 where the output was sampled; without it, everywhere
+VANES_LATE = "vanes late"  # a column: s, by which each row of the vane angles stands late; without it, 0
 
 
 class Driven(NamedTuple):
@@ -180,6 +181,7 @@ def excerpts(
         part = make(driven.at(at, columns, keep(at))._replace(again=True))
         part.floor, part.quiet, part.noise = stage.floor, stage.quiet, stage.noise
         part.raster_error, part.memory = stage.raster_error, stage.memory
+        part.lost = None if stage.lost is None else stage.lost[..., at]
         return part
 
     return excerpt

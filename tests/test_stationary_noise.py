@@ -1,0 +1,155 @@
+"""Noise that is the same under every condition is told from missing physics, which is not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import scipy
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks.loggers import Logger, recorded
+from hil.logs import Log
+from tests import rig
+from tests.firmware_on_rig import firmware
+from tests.rig import Hidden
+from tests.test_recorders import fine, verdicts
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.subsystem import Array, Stage
+from vaneloop.identification.vane_chain.chain import build_chain
+from vaneloop.identification.vane_chain.stationary_noise import Expected, _noise_in, _over_blocks, like
+from vaneloop.identification.workflow import diagnose
+
+DT, ROWS = 0.01, 30_000
+T = DT * np.arange(ROWS)
+SPEED = np.interp(T % 20.0, [0.0, 4.0, 5.0, 9.0, 10.0, 14.0, 15.0, 20.0], [0.0, 0.0, 3.0, 3.0, 0.0, 0.0, -3.0, -3.0])
+FLOOR = 1.0
+
+
+def coloured(seed: int, tau: float = 0.1) -> Array:
+    """Noise of RMS 1 with that correlation time (s)."""
+    a, white = np.exp(-DT / tau), np.random.default_rng([seed, 1]).standard_normal(ROWS)
+    return np.asarray(scipy.signal.lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], white))
+
+
+def said(
+    error: Array, window: float | None = None, made: Array | None = None, own: Array | None = None
+) -> Expected | None:
+    """What is said of an error beyond a floor of 1, as an actuator's or linkage's that moves and rests; ``own``: what
+    its output does at rest, the same noise by default.
+    """
+    regimes = {"time": T, "stroke speed": SPEED, "direction": np.sign(SPEED), "stroke": np.cumsum(SPEED) * DT}
+    stage = Stage("s", ("y",), ("mm",), (), (), lambda p: np.zeros((len(p), 1, ROWS)), T, error[None], window=window,
+                  regimes=regimes, floor=np.array([FLOOR]), memory=10.0)  # fmt: skip
+    judge = LeastSquaresProblem(stage, np.array([FLOOR]))
+    e = judge.errors(stage.neutral()[None])[0, 0]
+    output = np.cumsum(SPEED) * DT + (error if own is None else own)
+    return _noise_in(judge, 0, e, np.zeros(ROWS) if made is None else made, output)
+
+
+PHYSICS: dict[str, Callable[[Array], Array]] = {
+    "a lag": lambda white: white + 0.5 * SPEED,
+    "friction": lambda white: white + 1.5 * np.sign(SPEED),
+    "a bias": lambda white: white + 1.2,
+    "an error that grows with time": lambda white: white * (1.0 + T / T[-1]),
+    "vibration in motion": lambda white: white + np.abs(SPEED) * np.sin(40.0 * T),
+}
+
+
+@given(st.integers(0, 2**31), st.sampled_from([0.03, 0.1, 0.4]), st.floats(0.8, 3.0))
+def test_what_is_the_same_under_every_condition_is_noise(seed: int, tau: float, size: float) -> None:
+    white = np.random.default_rng(seed).standard_normal(ROWS)
+    found = said(white + size * coloured(seed, tau))
+    assert found is not None and found.share == 0.0
+    assert found.size == pytest.approx(np.hypot(1.0, size), rel=0.2)
+
+
+@given(st.integers(0, 2**31), st.sampled_from(sorted(PHYSICS)))
+def test_what_turns_on_a_condition_is_none(seed: int, law: str) -> None:
+    assert said(PHYSICS[law](np.random.default_rng(seed).standard_normal(ROWS))) is None
+
+
+def test_a_drift_in_every_window_is_no_noise() -> None:
+    """That of a piston whose valve has a null bias: alike under every condition, and always to the same side."""
+    white = np.random.default_rng(1).standard_normal(ROWS)
+    assert said(white + 4.0 * (T % 1.0), window=1.0) is None
+    assert said(white + coloured(1), window=1.0) is not None
+
+
+def test_an_error_that_its_output_does_not_show_where_it_is_quiet_is_no_noise_of_it() -> None:
+    """That of a piston that rests within its valve's dead band: alike under every condition."""
+    white = np.random.default_rng(5).standard_normal(ROWS)
+    error = white + 3.0 * coloured(5)
+    assert said(error, window=1.0) is not None
+    assert said(error, window=1.0, own=white) is None
+    through = said(error, window=1.0, own=white, made=np.full(ROWS, 9.0))  # but it may come in by what drives it
+    assert through is not None and through.share > 0.5
+
+
+def test_an_excess_that_the_bins_could_not_tell_is_not_taken_for_noise() -> None:
+    white = np.random.default_rng(2).standard_normal(ROWS)
+    assert said(white) == Expected(FLOOR, 0.0)
+    assert said(1.02 * white) is None
+
+
+def test_noise_through_a_gain_is_expected_where_the_gain_is() -> None:
+    """Of a channel that drives the subsystem: half of its power is an error, where there is a gain."""
+    gain = np.where(T % 20.0 < 10.0, 0.1, 3.0)
+    error = np.random.default_rng(3).standard_normal(ROWS) + np.sqrt(0.5) * gain * coloured(3)
+    found = said(error, made=gain**2)
+    assert found is not None and found.share == pytest.approx(0.5, rel=0.15)
+    assert said(error) is None
+
+
+@given(st.integers(0, 2**31), st.sampled_from([0.02, 0.1, 0.3]))
+def test_drawn_noise_has_the_power_and_the_colour_of_what_was_seen(seed: int, tau: float) -> None:
+    seen = coloured(seed, tau)
+    drawn = like(seen.reshape(-1, 400), ROWS, seed)
+    assert np.std(drawn) == pytest.approx(np.std(seen), rel=0.15)
+    lag = round(tau / DT)
+    assert np.mean(drawn[lag:] * drawn[:-lag]) / np.var(drawn) == pytest.approx(np.exp(-1.0), abs=0.15)
+
+
+def test_the_jackknife_over_blocks_is_the_deviation_of_a_mean() -> None:
+    values = np.random.default_rng(4).standard_normal((3, 40)) + 5.0
+    ratio, deviation = _over_blocks(values, np.ones((3, 40)))
+    assert ratio == pytest.approx(values.mean(axis=1))
+    assert deviation == pytest.approx(values.std(axis=1, ddof=1) / np.sqrt(40.0))
+    values[1, 1:], there = 0.0, np.ones((3, 40))
+    there[1, 1:] = 0.0  # a bin that one block has alone
+    assert np.isfinite(_over_blocks(values, there)).all()
+
+
+RECORDERS = {
+    "coloured noise": Logger(100, colour=(0.1, 1.0)),
+    "slow coloured noise": Logger(1000, colour=(0.4, 1.0)),
+    "a clock that drifts": Logger(200, drift=-4e-5),
+    "slow rows behind a mean": Logger(20, window=0.05),
+    "slow rows behind a low-pass": Logger(10, filter=(2, 2.4)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", RECORDERS)
+def test_what_a_recorder_adds_to_a_clean_log_is_no_missing_physics(kind: str) -> None:
+    log = recorded(fine(), RECORDERS[kind], np.random.default_rng(2))
+    answer = verdicts(build_chain(Log(kind, log)))
+    assert set(answer.values()) == {"none"}, answer
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("hidden", "stage"),
+    [
+        (Hidden("valve_dead_band", {"half_width": 1e-3}), "actuator"),
+        (Hidden("valve_null_bias", {"bias": 5e-4}), "actuator"),
+        (Hidden("linkage_backlash", {"stage": 0, "width": 0.01}), "linkage"),
+    ],
+)
+def test_physics_is_named_behind_the_noise_of_a_recorder(hidden: Hidden, stage: str) -> None:
+    log = rig.simulate(rig.manoeuvre(41, 120.0), firmware(), [hidden], seed=41, rate=1000).log
+    chain = build_chain(Log("log", recorded(log, RECORDERS["coloured noise"], np.random.default_rng(3))))
+    (d,) = diagnose([chain.stage(stage)], workers=1).stages
+    assert hidden.name in {n for f in d.effects for n in (f.effect, *f.rivals)}, d

@@ -1,0 +1,192 @@
+"""Noise that is slower than a log's rows, or that comes into a subsystem through a channel that drives it.
+
+`hil.figures.noise_floor` sees what changes from row to row, and the coloured noise of a recorder is more than that.
+What tells it from missing physics: it is the same under every condition. An error is taken for noise where
+
+* its mean square in the bins of every condition is what is expected, within half of what exceeds the floor,
+* no bin has a mean that makes as much of it, or such a slope in the windows whose constant is free,
+* but for the one bin in twenty that chance allows; and the bins are known well enough to tell.
+
+Expected is the output's own noise, which is no more than how the output moves where it is quietest, and a share of what
+draws of noise do in a channel that drives the subsystem, which through a table or through play is not alike everywhere.
+A valve with a dead band leaves an error that is much the same under every condition; its piston rests meanwhile. The
+noise of a channel is what the subsystem that explains it leaves, once that is known to be noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
+from vaneloop.identification.regimes import bins_of
+from vaneloop.identification.settings import (
+    FLOOR_KNOWN,
+    NOISE_ALIKE,
+    NOISE_BY_CHANCE,
+    NOISE_DRAWS,
+    NOISE_WINDOW,
+    QUIET_KNOWN_TO,
+)
+from vaneloop.identification.subsystem import Array, Stage, noise_of
+from vaneloop.identification.vane_chain.subsystem_data import Made
+
+__all__ = ["expect_stationary_noise", "like"]
+
+# each subsystem after those that explain what drives it: the channel whose noise it may pass on
+ORDER: Mapping[str, str] = {"engine": "", "servo": "", "actuator": "i_cmd", "demand": "n_r", "linkage": "x_lvdt"}
+ALSO = {"x_lvdt": ("stroke",), "i_cmd": ("ticks", "other_ticks")}  # columns that hold the same
+
+
+class Expected(NamedTuple):
+    """The noise of an output: its RMS, and the share of the draws' power in it."""
+
+    size: float
+    share: float
+
+
+def expect_stationary_noise(stages: Sequence[Stage]) -> list[str]:
+    """Have each stage whose error is noise that its floor does not hold expect it: its ``lost``, ``raster_error`` and
+    ``floor``. Returns what is to be said of them.
+    """
+    of = {s.name: s for s in stages if isinstance(s.made, Made) and s.floor is not None}
+    noise: dict[str, Array] = {}  # channel -> its noise in windows
+    notes = []
+    for stage, through in ((of[name], through) for name, through in ORDER.items() if name in of):
+        judge = LeastSquaresProblem(stage, np.asarray(stage.floor))
+        e = judge.errors(recalibrate(judge).theta[None])[0] * judge.floor[:, None]
+        squares = np.sum(e * e, axis=1) / np.maximum(judge.valid.sum(axis=1), 1)
+        if np.any(squares > ((1.0 + FLOOR_KNOWN) * judge.floor) ** 2):
+            draws = _draws(stage, through, noise[through]) if through in noise else None
+            made = np.zeros_like(e) if draws is None else np.mean(draws**2, axis=0)
+            columns = stage.made.driven.columns  # type: ignore[attr-defined]
+            found = [_noise_in(judge, k, e[k], made[k], columns[o]) for k, o in enumerate(stage.outputs)]
+            if any(one is None for one in found):
+                continue
+            notes.append(_said(stage, [one for one in found if one is not None]))
+            _expect(stage, [one for one in found if one is not None], draws)
+        for k, channel in enumerate(stage.outputs):
+            noise[channel] = _windows(stage, np.where(judge.valid[k], e[k], np.nan))
+    return notes
+
+
+def like(windows: Array, samples: int, seed: int) -> Array:
+    """Noise with the mean spectrum of ``windows``, float64[windows, any], each of its frequencies at a phase by chance:
+    float64[samples].
+    """
+    width = windows.shape[1]
+    taper = np.hanning(width)
+    power = np.mean(np.abs(np.fft.rfft(windows * taper)) ** 2, axis=0) / np.sum(taper**2)
+    at = np.fft.rfftfreq(samples)
+    draw = np.random.default_rng(seed)
+    phases = draw.standard_normal(len(at)) + 1j * draw.standard_normal(len(at))
+    size = np.sqrt(np.interp(at, np.fft.rfftfreq(width), power) * samples / 2.0)
+    return np.asarray(np.fft.irfft(size * phases, samples))
+
+
+def _windows(stage: Stage, error: Array) -> Array:
+    """An error in windows without a gap, float64[windows, samples]: those in which its constant is free, or of
+    `NOISE_WINDOW`.
+    """
+    width = max(8, round((stage.window or NOISE_WINDOW) / float(stage.t[1] - stage.t[0])))
+    whole = error[: len(error) // width * width].reshape(-1, width)
+    return np.asarray(whole[np.isfinite(whole).all(axis=1)])
+
+
+def _draws(stage: Stage, channel: str, windows: Array) -> Array | None:
+    """What draws of the noise of a ``channel``, seen in ``windows``, make of a stage's outputs, float64[draws, outputs,
+    samples]; None where no window shows any.
+    """
+    if not windows.any():
+        return None
+    made, neutral = stage.made, stage.neutral()[None]
+    assert isinstance(made, Made)
+    columns = made.driven.columns
+    out = []
+    for seed in range(NOISE_DRAWS):
+        noise = like(windows, len(stage.t), seed)
+        noisy = {
+            c: columns[c] + noise for c in {channel, *({"stroke"} if channel == "x_lvdt" else ())} & columns.keys()
+        }
+        varied = made.make(made.driven._replace(columns=columns | noisy, again=True))
+        out.append(varied.run(neutral)[0] - stage.run(neutral)[0])
+    return np.array(out)
+
+
+def _noise_in(judge: LeastSquaresProblem, k: int, error: Array, made: Array, output: Array) -> Expected | None:
+    """The noise that the ``error`` of output ``k`` is, float64[samples] in its unit; None: it is none.
+
+    made    mean square of what draws of noise in a driving channel make of it, float64[samples]
+    output  as it was logged: in its quietest windows there is no less than its noise
+    """
+    stage, floor = judge.stage, float(judge.floor[k])
+    bins = [b for values in stage.regimes.values() if (b := bins_of(judge, k, values)) is not None]
+    if not bins:
+        return None
+    place = ((stage.t - stage.t[0]) / stage.window) % 1.0 - 0.5 if stage.window else np.ones_like(stage.t)
+    n, square, through, sign = (
+        np.concatenate([b.sums(x) for b in bins]) for x in (np.ones_like(error), error**2, made, error * place)
+    )
+    count = n.sum(axis=1)
+    whole = float(square.sum() / count.sum())
+    counted = np.where(judge.valid[k], error, np.nan)
+    quiet, own_quiet = (_quiet(_windows(stage, x)) for x in (np.where(judge.valid[k], output, np.nan), counted))
+    most = whole * (QUIET_KNOWN_TO * quiet / max(own_quiet, 1e-300)) ** 2
+    weight = 1.0 / (np.sqrt(count) * whole)
+    a = np.array([whole * count, through.sum(axis=1)]).T
+    bounds = ([0.0, 0.0], [max(most / whole, 1e-9), 1.0])
+    own, share = scipy.optimize.lsq_linear(a * weight[:, None], square.sum(axis=1) * weight, bounds).x * (whole, 1.0)
+    excess = 1.0 - floor**2 / whole
+    if whole <= ((1.0 + FLOOR_KNOWN) * floor) ** 2:
+        return Expected(floor, 0.0)
+    ratio, deviation = _over_blocks(square, own * n + share * through)
+    mean, of_mean = _over_blocks(sign, n)
+    of_sign = NOISE_ALIKE * excess * whole * float(np.mean(place[judge.valid[k]] ** 2))
+    differs = np.abs(ratio - 1.0) > NOISE_ALIKE * excess + 2.0 * deviation
+    signed = np.maximum(np.abs(mean) - 2.0 * of_mean, 0.0) ** 2 > of_sign
+    told = float(np.median(deviation)) <= 0.5 * NOISE_ALIKE * excess
+    if not told or max(np.mean(differs), np.mean(signed)) > NOISE_BY_CHANCE:
+        return None
+    return Expected(float(np.sqrt(whole)), float(share))
+
+
+def _quiet(windows: Array) -> float:
+    """RMS of the quietest tenth of windows, float64[windows, samples], beside their trend; 0 without windows."""
+    if not len(windows):
+        return 0.0
+    return float(np.quantile(scipy.signal.detrend(windows, axis=1).std(axis=1), 0.1))
+
+
+def _over_blocks(values: Array, expected: Array) -> tuple[Array, Array]:
+    """Sum of values over the sum expected, and its standard deviation by the jackknife over blocks: float64[bins] of
+    float64[bins, blocks].
+    """
+    total, of = values.sum(axis=1), expected.sum(axis=1)
+    ratio = total / of
+    there = expected > 0.0
+    left = (total[:, None] - values) / np.where(of[:, None] > expected, of[:, None] - expected, np.inf)
+    away = np.where(there, left - ratio[:, None], 0.0)
+    blocks = np.maximum(there.sum(axis=1), 2)
+    return ratio, np.sqrt(np.sum(away**2, axis=1) * (blocks - 1) / blocks)
+
+
+def _expect(stage: Stage, noise: Sequence[Expected], draws: Array | None) -> None:
+    floor, size = np.asarray(stage.floor), np.array([one.size for one in noise])
+    if draws is not None:
+        stage.lost = draws * np.sqrt([one.share for one in noise])[:, None]
+    more = np.sqrt(np.maximum(size**2 - floor**2, 0.0))
+    stage.raster_error = np.hypot(0.0 if stage.raster_error is None else stage.raster_error, more)
+    stage.floor = noise_of(stage, stage.neutral())
+
+
+def _said(stage: Stage, noise: Sequence[Expected]) -> str:
+    ratios = np.array([one.size for one in noise]) / np.asarray(stage.floor)
+    named = ", ".join(
+        f"{name} {one.size:.3g} {unit} ({ratio:.3g} times)"
+        for name, unit, one, ratio in zip(stage.outputs, stage.units, noise, ratios, strict=True)
+        if ratio > 1.0
+    )
+    return f"{stage.name}: noise beyond what changes from row to row, the same under every condition: {named}"
