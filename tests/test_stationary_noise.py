@@ -54,6 +54,7 @@ PHYSICS: dict[str, Callable[[Array], Array]] = {
     "friction": lambda white: white + 1.5 * np.sign(SPEED),
     "a bias": lambda white: white + 1.2,
     "an error that grows with time": lambda white: white * (1.0 + T / T[-1]),
+    "an oscillation": lambda white: white + 1.5 * np.sin(2.0 * np.pi * 7.3 * T),
     "vibration in motion": lambda white: white + np.abs(SPEED) * np.sin(40.0 * T),
 }
 
@@ -124,7 +125,7 @@ def test_the_jackknife_over_blocks_is_the_deviation_of_a_mean() -> None:
 
 RECORDERS = {
     "coloured noise": Logger(100, colour=(0.1, 1.0)),
-    "slow coloured noise": Logger(1000, colour=(0.4, 1.0)),
+    "coloured noise in fast rows": Logger(1000, colour=(0.06, 1.0)),
     "a clock that drifts": Logger(200, drift=-4e-5),
     "slow rows behind a mean": Logger(20, window=0.05),
     "slow rows behind a low-pass": Logger(10, filter=(2, 2.4)),

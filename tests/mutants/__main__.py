@@ -157,7 +157,8 @@ NEAREST = {
     ),
     "vaneloop.identification.vane_chain": (
         "vane_chain_spec recorders stationary_noise late_channels same_answer learn_vanes learn_lags learn_stops "
-        "learn_followers learn_faint learn_screening held loggers long_logs identification curves directions electromechanical readings"
+        "learn_followers learn_faint learn_screening held loggers long_logs identification curves directions "
+        "electromechanical readings"
     ),
     "vaneloop.design": "design_spec schedule_spec design schedule spatial strategies tables tolerances",
     "vaneloop.fleet": "fleet_folder fleet_trends fleet_workers campaign_numbers fleet_report fleet_run campaign",

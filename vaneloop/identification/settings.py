@@ -1506,10 +1506,10 @@ NOISE_BY_CHANCE = setting(
     "principle: by chance one in twenty is",
 )
 QUIET_KNOWN_TO = setting(
-    1.5,
+    2.0,
     "times",
-    "The noise of an output may be so many times how it moves in its quietest windows.",
-    "principle: a tenth quantile of few windows of coloured noise is known to a third",
+    "The noise of a channel may be so many times how it moves in its quietest windows.",
+    "principle: noise as slow as a window is twice its deviation from a trend in there",
 )
 NOISE_WINDOW = setting(
     4.0,

@@ -5,12 +5,14 @@ What tells it from missing physics: it is the same under every condition. An err
 
 * its mean square in the bins of every condition is what is expected, within half of what exceeds the floor,
 * no bin has a mean that makes as much of it, or such a slope in the windows whose constant is free,
+* no line of its spectrum does: what swings has a cause,
 * but for the one bin in twenty that chance allows; and the bins are known well enough to tell.
 
 Expected is the output's own noise, which is no more than how the output moves where it is quietest, and a share of what
 draws of noise do in a channel that drives the subsystem, which through a table or through play is not alike everywhere.
-A valve with a dead band leaves an error that is much the same under every condition; its piston rests meanwhile. The
-noise of a channel is what the subsystem that explains it leaves, once that is known to be noise.
+The noise of a channel is how it moves where it is quietest, or what the subsystem that explains it leaves, once that is
+known to be noise. So a valve's dead band, whose error is much the same under every condition, is none: its piston
+rests.
 """
 
 from __future__ import annotations
@@ -30,14 +32,16 @@ from vaneloop.identification.settings import (
     NOISE_DRAWS,
     NOISE_WINDOW,
     QUIET_KNOWN_TO,
+    WINDOW,
 )
 from vaneloop.identification.subsystem import Array, Stage, noise_of
+from vaneloop.identification.vane_chain.current import law_of
 from vaneloop.identification.vane_chain.subsystem_data import Made
 
 __all__ = ["expect_stationary_noise", "like"]
 
 # each subsystem after those that explain what drives it: the channel whose noise it may pass on
-ORDER: Mapping[str, str] = {"engine": "", "servo": "", "actuator": "i_cmd", "demand": "n_r", "linkage": "x_lvdt"}
+ORDER: Mapping[str, str] = {"engine": "", "servo": "x_lvdt", "actuator": "i_cmd", "demand": "n_r", "linkage": "x_lvdt"}
 ALSO = {"x_lvdt": ("stroke",), "i_cmd": ("ticks", "other_ticks")}  # columns that hold the same
 
 
@@ -54,6 +58,9 @@ def expect_stationary_noise(stages: Sequence[Stage]) -> list[str]:
     """
     of = {s.name: s for s in stages if isinstance(s.made, Made) and s.floor is not None}
     noise: dict[str, Array] = {}  # channel -> its noise in windows
+    for stage, channel in ((of[name], channel) for name, channel in ORDER.items() if name in of):
+        if channel in (columns := stage.made.driven.columns):  # type: ignore[attr-defined]
+            noise[channel] = _quietest(_windows(stage, columns[channel], WINDOW))
     notes = []
     for stage, through in ((of[name], through) for name, through in ORDER.items() if name in of):
         judge = LeastSquaresProblem(stage, np.asarray(stage.floor))
@@ -61,7 +68,9 @@ def expect_stationary_noise(stages: Sequence[Stage]) -> list[str]:
         squares = np.sum(e * e, axis=1) / np.maximum(judge.valid.sum(axis=1), 1)
         if np.any(squares > ((1.0 + FLOOR_KNOWN) * judge.floor) ** 2):
             draws = _draws(stage, through, noise[through]) if through in noise else None
-            made = np.zeros_like(e) if draws is None else np.mean(draws**2, axis=0)
+            made = np.zeros_like(e)
+            if draws is not None:  # as errors are: without the free constants
+                made = np.mean(judge._whiten(judge.measured - draws) ** 2, axis=0) * judge.floor[:, None] ** 2
             columns = stage.made.driven.columns  # type: ignore[attr-defined]
             found = [_noise_in(judge, k, e[k], made[k], columns[o]) for k, o in enumerate(stage.outputs)]
             if any(one is None for one in found):
@@ -69,7 +78,7 @@ def expect_stationary_noise(stages: Sequence[Stage]) -> list[str]:
             notes.append(_said(stage, [one for one in found if one is not None]))
             _expect(stage, [one for one in found if one is not None], draws)
         for k, channel in enumerate(stage.outputs):
-            noise[channel] = _windows(stage, np.where(judge.valid[k], e[k], np.nan))
+            noise[channel] = _windows(stage, np.where(judge.valid[k], e[k], np.nan), stage.window)
     return notes
 
 
@@ -87,12 +96,10 @@ def like(windows: Array, samples: int, seed: int) -> Array:
     return np.asarray(np.fft.irfft(size * phases, samples))
 
 
-def _windows(stage: Stage, error: Array) -> Array:
-    """An error in windows without a gap, float64[windows, samples]: those in which its constant is free, or of
-    `NOISE_WINDOW`.
-    """
-    width = max(8, round((stage.window or NOISE_WINDOW) / float(stage.t[1] - stage.t[0])))
-    whole = error[: len(error) // width * width].reshape(-1, width)
+def _windows(stage: Stage, values: Array, seconds: float | None) -> Array:
+    """Values in windows of so many seconds without a gap, float64[windows, samples]."""
+    width = max(8, round((seconds or NOISE_WINDOW) / float(stage.t[1] - stage.t[0])))
+    whole = values[: len(values) // width * width].reshape(-1, width)
     return np.asarray(whole[np.isfinite(whole).all(axis=1)])
 
 
@@ -108,9 +115,11 @@ def _draws(stage: Stage, channel: str, windows: Array) -> Array | None:
     out = []
     for seed in range(NOISE_DRAWS):
         noise = like(windows, len(stage.t), seed)
-        noisy = {
-            c: columns[c] + noise for c in {channel, *({"stroke"} if channel == "x_lvdt" else ())} & columns.keys()
-        }
+        names = {channel, *ALSO.get(channel, ())} & columns.keys()
+        noisy = {c: columns[c] + (noise if columns[c].ndim == 1 else noise[:, None]) for c in names}
+        if stage.name == "servo":
+            law = law_of(np.zeros(len(noise)), noise, made.driven.calibration)
+            noisy["law"] = columns["law"] + law[:, -columns["law"].shape[1] :]
         varied = made.make(made.driven._replace(columns=columns | noisy, again=True))
         out.append(varied.run(neutral)[0] - stage.run(neutral)[0])
     return np.array(out)
@@ -133,11 +142,12 @@ def _noise_in(judge: LeastSquaresProblem, k: int, error: Array, made: Array, out
     count = n.sum(axis=1)
     whole = float(square.sum() / count.sum())
     counted = np.where(judge.valid[k], error, np.nan)
-    quiet, own_quiet = (_quiet(_windows(stage, x)) for x in (np.where(judge.valid[k], output, np.nan), counted))
-    most = whole * (QUIET_KNOWN_TO * quiet / max(own_quiet, 1e-300)) ** 2
+    most = QUIET_KNOWN_TO**2 * _power(
+        _quietest(_windows(stage, np.where(judge.valid[k], output, np.nan), stage.window))
+    )
     weight = 1.0 / (np.sqrt(count) * whole)
     a = np.array([whole * count, through.sum(axis=1)]).T
-    bounds = ([0.0, 0.0], [max(most / whole, 1e-9), 1.0])
+    bounds = ([0.0, 0.0], [max(most / whole, 1e-9), QUIET_KNOWN_TO**2])
     own, share = scipy.optimize.lsq_linear(a * weight[:, None], square.sum(axis=1) * weight, bounds).x * (whole, 1.0)
     excess = 1.0 - floor**2 / whole
     if whole <= ((1.0 + FLOOR_KNOWN) * floor) ** 2:
@@ -147,17 +157,24 @@ def _noise_in(judge: LeastSquaresProblem, k: int, error: Array, made: Array, out
     of_sign = NOISE_ALIKE * excess * whole * float(np.mean(place[judge.valid[k]] ** 2))
     differs = np.abs(ratio - 1.0) > NOISE_ALIKE * excess + 2.0 * deviation
     signed = np.maximum(np.abs(mean) - 2.0 * of_mean, 0.0) ** 2 > of_sign
-    told = float(np.median(deviation)) <= 0.5 * NOISE_ALIKE * excess
+    spectrum = np.abs(np.fft.rfft(np.nan_to_num(counted - np.nanmean(counted)))) ** 2
+    line = float(np.convolve(spectrum, np.ones(3), "same").max() / spectrum.sum())
+    told = line < NOISE_ALIKE * excess and float(np.median(deviation)) <= 0.5 * NOISE_ALIKE * excess
     if not told or max(np.mean(differs), np.mean(signed)) > NOISE_BY_CHANCE:
         return None
     return Expected(float(np.sqrt(whole)), float(share))
 
 
-def _quiet(windows: Array) -> float:
-    """RMS of the quietest tenth of windows, float64[windows, samples], beside their trend; 0 without windows."""
+def _quietest(windows: Array) -> Array:
+    """The quietest tenth of windows, float64[windows, samples], beside their trend: at least one, if there is any."""
     if not len(windows):
-        return 0.0
-    return float(np.quantile(scipy.signal.detrend(windows, axis=1).std(axis=1), 0.1))
+        return windows
+    level = scipy.signal.detrend(windows, axis=1)
+    return np.asarray(level[np.argsort(level.std(axis=1))[: max(1, round(0.1 * len(level)))]])
+
+
+def _power(windows: Array) -> float:
+    return float(np.mean(windows**2)) if len(windows) else np.inf
 
 
 def _over_blocks(values: Array, expected: Array) -> tuple[Array, Array]:
