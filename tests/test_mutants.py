@@ -16,7 +16,9 @@ import pytest
 from tests.conftest import ROOT
 from tests.mutants import campaign as trial
 from tests.mutants.__main__ import ENOUGH, STRICT, TARGETS
+from tests.mutants.campaign import SETTINGS
 from tests.mutants.mutate import PRODUCT, made_of, mutants_of
+from vaneloop.identification.settings import RECORD
 
 TINY = '''
 from dataclasses import dataclass
@@ -141,6 +143,14 @@ def test_every_file_of_the_product_belongs_to_a_target_and_its_tests_are_there()
     assert not [f for f in left if not f.endswith(("__init__.py", "__main__.py")) or "def " in (ROOT / f).read_text()]
     assert not [t for target in TARGETS for t in target.tests if not (ROOT / t.split("::")[0]).is_file()]
     assert {t.enough for t in TARGETS} == {ENOUGH, STRICT}
+
+
+def test_every_threshold_of_the_identification_belongs_to_the_rooms_that_read_it() -> None:
+    rooms = [t for t in TARGETS if t.name.startswith("vaneloop.identification")]
+    assert {name for t in rooms for name in t.thresholds} == set(RECORD)
+    assert all(SETTINGS in t.paths() for t in rooms if t.thresholds)
+    (selection,) = (t for t in rooms if t.name == "vaneloop.identification.selection")
+    assert "NATS" in selection.thresholds and "REGIME_BINS" not in selection.thresholds
 
 
 def test_what_a_module_makes_of_a_class_is_made_anew_with_a_field_s_other_default(

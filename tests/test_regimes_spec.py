@@ -183,6 +183,52 @@ def test_an_onset_is_where_a_quiet_error_rises_for_good(at: float, before: float
     assert onset(judge, fit) is None
 
 
+# a block is a fifth of the stage's time scale, here of 10 s
+BLOCK = 40
+
+
+def stepped(before: float, after: float, at: int) -> tuple[LeastSquaresProblem, Any]:
+    """An error whose size steps at the beginning of a block, without any scatter."""
+    sizes = np.where(np.arange(N) < BLOCK * at, before, after)
+    stage = stage_of(sizes * np.where(np.arange(N) % 2, 1.0, -1.0), {"time": T})
+    stage.memory = 10.0
+    return problem(stage)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "at", "found"),
+    [
+        (1.0, np.exp(0.26), 20, True), (1.0, np.exp(0.24), 20, False),  # by half a nat of power, not less
+        (np.sqrt(1.29), 3.0, 20, True), (np.sqrt(1.31), 3.0, 20, False),  # where it was no more than noise before
+        (1.0, 3.0, 5, True), (1.0, 3.0, 55, True), (0.0, 0.02, 20, False), (0.0, 0.05, 20, True),
+    ],
+)  # fmt: skip
+def test_an_onset_is_told_at_the_block_in_which_a_quiet_error_steps_up(
+    before: float, after: float, at: int, found: bool
+) -> None:
+    judge, fit = stepped(before, after, at)
+    when = pytest.approx(T[BLOCK * at]) if found else None
+    assert onset(judge, fit) == when
+    here = locate(judge, fit)
+    assert here.onset == (when if here.hot else None)  # where nothing fails, nothing begins to
+
+
+def test_of_few_samples_in_its_time_scale_an_onset_is_a_sample() -> None:
+    judge, fit = stepped(1.0, 3.0, 5)
+    judge.memory = 5.0 * 0.05
+    assert onset(judge, fit) == pytest.approx(T[BLOCK * 5])
+    judge.memory = 0.01 * 0.05
+    assert onset(judge, fit) == pytest.approx(T[BLOCK * 5])
+
+
+def test_an_onset_asks_for_sixteen_blocks_that_are_three_tenths_measured() -> None:
+    for blocks, each, found in ((16, 13, True), (15, 13, False), (16, 12, False)):
+        stage = stepped(1.0, 3.0, 10)[0].stage
+        stage.measured[0, np.arange(N) % BLOCK >= each] = np.nan
+        stage.measured[0, BLOCK * blocks :] = np.nan
+        assert onset(*problem(stage)) == (pytest.approx(T[BLOCK * 10]) if found else None)
+
+
 @given(ratio=st.floats(0.1, 3.0), limit=st.floats(1.0, 2.0))
 @settings_of(max_examples=examples(15), deadline=None)
 def test_a_signal_agrees_up_to_its_tolerance(ratio: float, limit: float) -> None:
@@ -216,6 +262,10 @@ BOTH = np.linspace(-4.0, 4.0, 8)
          "falls linearly with load and opposes the motion, from -2 mm at 1 to -18 mm at 9 kN"),
         ("load, against the motion", X, 2.0 * X,
          "grows linearly with load and follows the motion, from 2 mm at 1 to 18 mm at 9 kN"),
+        ("load", X, np.linspace(3.0, 4.0, 8),
+         "grows linearly with load, independent of direction, from 3 mm at 1 to 4 mm at 9 kN"),
+        ("load", np.full(3, 2.0), np.array([1.0, 9.0, 2.0]),
+         "is greatest, 9 mm, near load 2 kN, independent of direction, from 1 mm at 2 to 2 mm at 2 kN"),
         ("load", X, 5.0 + 0.01 * X, "is nearly constant at 5.05 mm, independent of direction"),
         ("load", X[:2], np.array([1.0, 3.0]),
          "differs between load 1 and 2.14 kN: 1 and 3 mm, independent of direction"),
@@ -258,6 +308,145 @@ def test_what_is_left_is_told_as_a_function_of_what_explains_most(kind: str) -> 
         expected = 1.0 - (0.3 * FLOOR) ** 2 / total
         assert s.explained == pytest.approx(expected, abs=0.06)
         assert s.text.endswith(f"; explains {100 * s.explained:.0f} % of what is left")
+
+
+@pytest.mark.parametrize("against", [False, True])
+def test_of_a_stage_that_integrates_the_rate_of_the_error_is_told(against: bool) -> None:
+    rng = np.random.default_rng(6)
+    load = np.interp(T, np.arange(0.0, 130.0, 4.0), rng.uniform(0.0, 8.0, 33))
+    direction = np.sign(np.sin(1.1 * T))
+    rate = 5.0 * load * (-direction if against else 1.0)  # noise floors per second
+    error = 0.05 * np.cumsum(rate) + 0.1 * rng.standard_normal(N)
+    stage = stage_of(error, {"load": load, "direction": direction}, window=20.0)
+    stage.memory = 100.0
+    judge, fit = problem(stage)
+    (s,) = shape(judge, fit)
+    assert s.feature == ("load, against the motion" if against else "load") and (s.x_unit, s.y_unit) == ("kN", "mm/s")
+    says = "falls linearly with load and opposes the motion" if against else "grows linearly with load, independent of"
+    assert s.text.startswith(f"rate of the error of y {says}")
+    slope = np.full(N, np.nan)  # over a second to each side, within a window
+    for first, end in ((0, 400), (400, 800), (800, 1200), (1200, 1600), (1600, N)):  # the rest is no window of its own
+        slope[first + 20 : end - 20] = FLOOR * (error[first + 40 : end] - error[first : end - 40]) / 2.0
+    target = slope * (direction if against else 1.0)
+    told = np.isfinite(target)
+    edges = _edges(load[told])
+    of = np.clip(np.digitize(load, edges) - 1, 0, REGIME_BINS - 1)
+    assert s.y == pytest.approx([target[told & (of == b)].mean() for b in range(REGIME_BINS)], abs=1e-9)
+    still = replace(judge.stage, measured=judge.stage.measured[:, :200], t=T[:200], regimes={"load": load[:200]},
+                    run=lambda thetas: np.zeros((len(thetas), 1, 200)))  # fmt: skip
+    short, fit = problem(still)
+    assert shape(short, fit) == []  # slopes of fewer than 200 samples say nothing
+
+
+@pytest.mark.parametrize("first", ["time", "load"])
+def test_time_is_named_only_where_nothing_physical_explains_as_much(first: str) -> None:
+    noise = 0.1 * np.random.default_rng(8).standard_normal(N)
+    of = {"time": T, "load": T**3}
+    conditions = {first: of[first], **of}
+    judge, fit = problem(stage_of(0.05 * T + noise, conditions))
+    assert shape(judge, fit)[0].feature == "load"
+
+
+@pytest.mark.parametrize(
+    ("hertz", "share", "told"),
+    [(2.5, 0.29, True), (2.5, 0.21, False), (1.5, 0.6, True), (1.3, 0.6, False), (9.0, 0.6, True)],
+)
+def test_a_line_is_told_that_is_a_quarter_of_the_error_and_quicker_than_the_stage(
+    hertz: float, share: float, told: bool
+) -> None:
+    noise = np.random.default_rng(9).standard_normal(N)
+    noise *= np.sqrt(1.0 - share) / noise.std()
+    judge, fit = problem(stage_of(np.sqrt(2.0 * share) * np.sin(2.0 * np.pi * hertz * T) + noise, {"time": T}))
+    (s,) = shape(judge, fit)
+    assert (s.feature == "frequency") == told
+    if told:
+        assert f"oscillates at {hertz:.2f} Hz" in s.text and s.explained == pytest.approx(share, abs=0.04)
+        assert s.x.min() > 1.4 and np.all(np.diff(s.x) > 0.0) and s.x[np.argmax(s.y)] == pytest.approx(hertz, abs=0.01)
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.14, False), (0.3, True)])
+def test_a_condition_is_told_that_explains_a_fifth_of_what_is_left(share: float, told: bool) -> None:
+    rng = np.random.default_rng(10)
+    load = np.repeat(rng.uniform(-1.0, 1.0, N // 40), 40)
+    of = np.sqrt(share) * load / np.sqrt(np.mean(load**2))
+    judge, fit = problem(stage_of(of + np.sqrt(1.0 - share) * rng.standard_normal(N), {"load": load}))
+    (s,) = shape(judge, fit)
+    assert s.explained == pytest.approx(share, abs=0.05) and ("not a function of" in s.text) != told
+
+
+def test_shapes_come_in_the_order_of_what_they_explain() -> None:
+    rng = np.random.default_rng(11)
+    load = np.repeat(rng.uniform(-4.0, 4.0, N // 8), 8)
+    stage = stage_of(np.zeros(N), {"load": load})
+    stage.outputs, stage.units, stage.floor = ("y", "z"), ("mm", "deg"), np.full(2, FLOOR)
+    stage.run = lambda thetas: np.zeros((len(thetas), 2, N))
+    stage.measured = FLOOR * np.array([load + 4.0 * rng.standard_normal(N), load + rng.standard_normal(N)])
+    judge = LeastSquaresProblem(stage, stage.floor)
+    fit = judge.fit((), stage.neutral())
+    assert [s.output for s in shape(judge, fit)] == ["z", "y"]
+    stage.measured[1, 150:] = np.nan  # of so few samples nothing is told
+    judge = LeastSquaresProblem(stage, stage.floor)
+    assert [s.output for s in shape(judge, fit)] == ["y"]
+    stage.regimes = {}
+    assert shape(judge, fit) == []
+
+
+def test_a_curve_is_told_of_the_samples_that_have_both_an_error_and_the_condition() -> None:
+    rng = np.random.default_rng(12)
+    load = np.repeat(rng.uniform(0.0, 8.0, N // 8), 8)
+    stage = stage_of(load + rng.standard_normal(N), {"load": load.copy()})
+    stage.measured[0, 200:500] = np.nan
+    stage.regimes["load"][400:900] = np.nan
+    judge, fit = problem(stage)
+    (s,) = shape(judge, fit)
+    both = np.isfinite(stage.measured[0]) & np.isfinite(stage.regimes["load"])
+    edges = _edges(load[both])
+    of = np.clip(np.digitize(load, edges) - 1, 0, REGIME_BINS - 1)
+    assert s.y == pytest.approx([stage.measured[0, both & (of == b)].mean() for b in range(REGIME_BINS)])
+    (r,) = regimes(judge, fit, 2.0)
+    assert r.samples.sum() == both.sum()
+    for lack in (101, 99):  # of fewer than 100 samples no condition is made
+        stage.measured[0, lack:] = np.nan
+        judge, fit = problem(stage)
+        assert len(regimes(judge, fit, 2.0)) == (lack == 101)
+
+
+def eight_bins(level: float, last: float) -> tuple[LeastSquaresProblem, Any]:
+    """Errors of this mean square in seven bins of a condition and of that in the eighth, without any scatter."""
+    load = np.arange(N) % 8
+    square = np.where(load == 7, last, level)
+    stage = stage_of(np.sqrt(square) * np.where(np.arange(N) // 8 % 2, 1.0, -1.0), {"load": load.astype(float)})
+    return problem(stage)
+
+
+# mean square over the noise at which one of eight bins of 300 samples stands out, two of which count as one
+STANDS_OUT = 1.0 + norm.isf(REGIME_LEVEL / 8) / np.sqrt(N / 8 / 4.0)
+
+
+@pytest.mark.parametrize("side", [0.99, 1.01])
+@pytest.mark.parametrize("level", [0.7, 1.0, 1.1, 1.5])
+def test_a_bin_is_held_against_what_all_others_have_as_far_as_a_floor_may_be_wrong(side: float, level: float) -> None:
+    limit = STANDS_OUT * max(1.0, min(level, most_floor(N, 2.0) ** 2))
+    judge, fit = eight_bins(level, side * limit)
+    (r,) = regimes(judge, fit, 2.0)
+    assert r.significant.tolist() == [False] * 7 + [side > 1.0]
+
+
+@pytest.mark.parametrize("side", [0.99, 1.01])
+@pytest.mark.parametrize("share", [0.3, 0.8, 1.7])
+def test_what_a_raster_hides_is_known_to_half_of_it(side: float, share: float) -> None:
+    limit = STANDS_OUT * (1.0 + min(share**2, 1.0) * (1.5**2 - 1.0))
+    judge, fit = eight_bins(1.0, side * limit)
+    judge.stage.raster_error = np.array([share * FLOOR])
+    (r,) = regimes(judge, fit, 2.0)
+    assert r.significant.tolist() == [False] * 7 + [side > 1.0]
+
+
+def test_directions_are_said_in_words() -> None:
+    three = np.zeros(3)
+    r = Regime("y", "mm", "direction", "", np.array([-1.5, -0.5, 0.5, 1.5]), three, three, three, three, 0.0, three)
+    words = [r.place(b) for b in range(3)]
+    assert words == ["direction negative", "direction at rest", "direction positive"]
 
 
 # ---- all stages together ---------------------------------------------------------------------------------------------
@@ -374,3 +563,24 @@ def test_a_bin_without_samples_is_never_the_worst() -> None:
         np.array([5, 0, 5]), np.zeros(3, dtype=bool), 0.0, np.full(3, np.nan),
     )  # fmt: skip
     assert r.worst() == "y: 0.2 mm (2 noise floors) at load 2 to 3"
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_search_tells_how_far_it_is_and_what_each_stage_says_at_once(workers: int) -> None:
+    stages = [replace(small(seed, size), name=name) for seed, size, name in ((8, 2.0, "one"), (9, 0.0, "two"))]
+    stages[0].measured = stages[0].measured + 0.5 * np.sin(2.0 * np.pi * 2.0 * stages[0].t)  # what no effect explains
+    stages[0].memory = 10.0
+    shares: list[float] = []
+    news: list[workflow.News] = []
+    d = workflow.diagnose(stages, {"x": "no oil"}, shares.append, workers, news=news.append)
+    assert shares == [n.fraction for n in news] and sorted(shares) == shares and shares[-1] == 1.0
+    assert sorted(n.found.stage for n in news if n.found) == ["one", "two"]
+    assert news[-1].text == "2 of 2 subsystems searched" and news[-1].found is not None
+    if workers == 1:
+        assert any("; trying one (2 effects, 1 fits)" in n.text for n in news)
+        assert [n.fraction for n in news if n.found] == [pytest.approx(0.5, abs=0.3), 1.0]
+    assert [s.stage for s in d.stages] == ["one", "two"] and d.verdict == d.stages[0].verdict == "unknown"
+    assert d.stages[1].verdict == "none"
+    assert list(d.shapes) == ["one"] and "oscillates at 2.0" in d.shapes["one"][0].text
+    assert d.not_observed == {"x": "no oil"} and d.notes == [] and 0.0 < d.elapsed_s < 100.0
+    assert workflow.diagnose(stages[1:], workers=workers).not_observed == {}

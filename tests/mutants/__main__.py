@@ -22,13 +22,6 @@ from .mutate import Mutant, mutants_of
 ENOUGH = 0.90  # of the mutants that are not equivalent
 STRICT = 0.95  # where a wrong answer is sent or believed: firmware, wire, calibration, diagnosis, search
 FIRMWARE = ("firmware", "modes", "monitors", "records", "schedule", "servo", "strategies", "trend")
-# The rooms of the identification, and the headings of its thresholds that their tests hold.
-HEADINGS = {
-    "vaneloop.identification": ("Least squares", "Noise", "Candidates", "Selection", "Regimes"),
-    "vaneloop.identification.user_models": ("User models",),
-    "vaneloop.identification.unmodelled": ("Unmodelled terms",),
-    "vaneloop.identification.vane_chain": ("Vane chain",),
-}
 SEARCH = tuple(
     f"vaneloop/identification/{f}.py"
     for f in (
@@ -45,12 +38,15 @@ def read_by(files: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def under(package: str) -> tuple[str, ...]:
-    """Thresholds of the identification that the tests of a package hold."""
-    return tuple(n for n, s in settings.RECORD.items() if s.heading in HEADINGS.get(package, ()))
+    """Thresholds of the identification that a room of it reads: its tests hold them."""
+    if not package.startswith("vaneloop.identification"):
+        return ()
+    files = (ROOT / package.replace(".", "/")).glob("*.py")
+    return read_by(tuple(sorted(str(f.relative_to(ROOT)) for f in files)))
 
 
 def files_of(package: str) -> tuple[str, ...]:
-    """A package's own files, and the record of thresholds where its tests hold some."""
+    """A package's own files, and the record of thresholds where it reads some."""
     own = f"{package.replace('.', '/')}/*.py"
     return (own, SETTINGS) if under(package) and not fnmatch(SETTINGS, own) else (own,)
 
@@ -140,9 +136,9 @@ NEAREST = {
     ),
     **dict.fromkeys(
         CORE,
-        "selection_spec least_squares_spec regimes_spec identification rules descent never_worse finite trust latest "
-        "laws names search_limits search_ahead promise directions rivals curves readings held long_logs doubts "
-        "learn_slopes same_answer",
+        "selection_spec least_squares_spec regimes_spec answer_spec candidates_spec onset identification rules descent "
+        "never_worse finite trust latest laws names search_limits search_ahead promise directions rivals curves "
+        "readings held long_logs doubts learn_slopes same_answer",
     ),
     "vaneloop.identification.candidates": (
         "candidates_spec laws own_laws curves curves_of_nobody hidden_law learn learn_band learn_confirmed "
