@@ -540,6 +540,9 @@ def test_the_json_of_a_diagnosis_says_what_its_stages_say() -> None:
 
     both = workflow.diagnosis_json(replace(d, stages=[stage_says("one", 20.0), stage_says("two", 50.0)]), "log.csv")
     assert [e["stage"] for e in both["effects"]] == ["two"]  # where it gains most
+    less = replace(stage_says("three", 90.0), effects=[replace(f, effect="c", probability=0.1)])
+    more = workflow.diagnosis_json(replace(d, stages=[less, stage_says("two", 50.0)]), "log.csv")
+    assert [(e["effect"], e["probability"]) for e in more["effects"]] == [("a", 0.5), ("c", 0.1)]
     lost = replace(
         d.stages[0], verdict="unknown", effects=[], nearest=[], refused=["a why"],
         candidates=[Candidate("a", 13.0, 1.0), Candidate("b", 11.0, 1.0)],
