@@ -114,6 +114,13 @@ def test_a_type_is_no_number(tmp_path: Path) -> None:
     assert [m.becomes for m in mutants_of(tmp_path, "typed.py")] == ["SIZE = 4"]
 
 
+def test_a_length_that_numpy_finds_out_is_no_number(tmp_path: Path) -> None:
+    (tmp_path / "shaped.py").write_text("def f(x):\n    return x.reshape(2, -1)\n")
+    assert [m.becomes for m in mutants_of(tmp_path, "shaped.py")] == [
+        "return x.reshape(3, -1)", "return x.reshape(2, 1)",
+    ]  # fmt: skip
+
+
 def test_a_threshold_is_named_without_what_is_said_of_it(tmp_path: Path) -> None:
     (tmp_path / "record.py").write_text("LIMIT = setting(4.0, 'mm', 'It ends here.', 'numerics: 2 bits')\n")
     assert [(m.was, m.becomes) for m in mutants_of(tmp_path, "record.py")] == [

@@ -136,9 +136,9 @@ NEAREST = {
     ),
     **dict.fromkeys(
         CORE,
-        "selection_spec least_squares_spec regimes_spec answer_spec candidates_spec onset identification rules descent "
-        "never_worse finite trust latest laws names search_limits search_ahead promise directions rivals curves "
-        "readings held long_logs doubts learn_slopes same_answer",
+        "selection_spec search_spec least_squares_spec regimes_spec answer_spec candidates_spec onset identification "
+        "rules descent never_worse finite trust latest laws names search_limits search_ahead promise directions rivals "
+        "curves readings held long_logs doubts learn_slopes same_answer",
     ),
     "vaneloop.identification.candidates": (
         "candidates_spec laws own_laws curves curves_of_nobody hidden_law learn learn_band learn_confirmed "

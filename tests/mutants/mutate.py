@@ -164,7 +164,12 @@ def _edits(owner: ast.AST) -> Iterator[_Edit]:
             if isinstance(node, ast.keyword) and node.arg == "strict":
                 continue  # of a zip: it asserts
             yield from _of_expression(owner, field, i, node)
-            yield from _edits(node)
+            if not (isinstance(node, ast.UnaryOp) and _is_reshape(owner)):  # numpy takes any length below 0 for -1
+                yield from _edits(node)
+
+
+def _is_reshape(node: ast.AST) -> bool:
+    return isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "reshape"
 
 
 def _statements(body: list[ast.stmt], owner: ast.AST, field: str) -> Iterator[tuple[ast.AST, str, int, ast.stmt]]:
