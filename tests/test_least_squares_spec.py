@@ -11,19 +11,21 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as settings_of
 from hypothesis import strategies as st
-from scipy.optimize import lsq_linear
+from scipy.optimize import least_squares, lsq_linear
 
 from tests.conftest import examples
 from vaneloop.identification import Effect, Parameter, Stage, StageError
 from vaneloop.identification.least_squares.broyden import BroydenJacobian, Known, LatestSlopes, bounded_step
+from vaneloop.identification.least_squares.levenberg_marquardt import carries as carries_along
 from vaneloop.identification.least_squares.noise import correlation_of, floor_deviation, most_floor, tolerance
-from vaneloop.identification.least_squares.problem import LeastSquaresProblem, covariance, recalibrate
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem, covariance, finished, recalibrate
 from vaneloop.identification.least_squares.residuals import ResidualCache
 from vaneloop.identification.results import at_bound, estimates, parameters_of, recalibrated, rms_of, rms_per_output
 from vaneloop.identification.subsystem import Array, lifted, noise_of, reach_of, size_of, without_jumps
 
 # docs/settings.md
 AGREES, SPREADS, COLOUR, NINETY, EVIDENCE, DIFFERENCE, NO_ANSWER_ERROR = 1.1, 3.0, (2.0, 5.0), 1.645, 200.0, 1e-3, 1e6
+CARRIED_VALUES, KEPT_SLOPES = 400_000, 2_000_000
 
 N = 240
 T = 9.0 + 0.5 * np.arange(N)  # s
@@ -505,3 +507,169 @@ def test_an_error_that_lifts_a_floor_by_less_than_that_is_known_to_is_none() -> 
     floor = np.array([0.03, 0.008])
     assert lifted(floor, 2e-3) == pytest.approx([0.03, np.hypot(0.008, 2e-3)], rel=1e-12)
     assert lifted(floor, 2e-3)[0] == floor[0]
+
+
+# ---- descents --------------------------------------------------------------------------------------------------------
+
+DECAY = np.linspace(0.0, 4.0, N)
+GROWN = Effect(
+    "law", (Parameter("size", 0.0, "1", -9.0, 9.0), Parameter("rate", 0.0, "1/s", 0.0, 5.0)), ((1.0, 1.0), (2.0, 0.5))
+)
+
+
+def decaying(seed: int, size: float, rate: float, asked: list[int] | None = None, **more: Any) -> Stage:
+    """y = gain + size exp(-rate t), which is not linear in the rate."""
+
+    def run(thetas: Array) -> Array:
+        if asked is not None:
+            asked.append(len(thetas))
+        gain, a, k = thetas.T[:, :, None]
+        return np.asarray(gain + a * np.exp(-k * DECAY))[:, None, :]
+
+    measured = run(np.array([[1.2, size, rate]]))[0] + FLOOR[0] * np.random.default_rng(seed).standard_normal((1, N))
+    gain = Parameter("gain", 1.0, "1", 0.0, 9.0, 0.5)
+    return Stage("law", ("y",), ("mm",), (gain,), (GROWN,), run, T, measured, floor=FLOOR[:1], **more)
+
+
+@given(
+    seed=st.integers(0, 99), size=st.floats(1.0, 8.0), rate=st.floats(0.6, 3.0), carries=st.booleans(),
+    way=st.sampled_from(["at once", "by and by", "from a fit", "with slopes", "sparing"]),
+)  # fmt: skip
+@settings_of(max_examples=examples(20), deadline=None)
+def test_a_descent_ends_where_scipy_s_does(seed: int, size: float, rate: float, carries: bool, way: str) -> None:
+    stage = decaying(seed, size, rate, carries=carries)
+    judge = LeastSquaresProblem(stage, FLOOR[:1])
+    start = np.array([1.0, 1.0, 1.0])
+
+    def off(theta: Array) -> Array:
+        return np.append(
+            (stage.measured - stage.run(theta[None])[0]).ravel() / FLOOR[0], np.sqrt(12.0) * (theta[0] - 1.0)
+        )
+
+    best = least_squares(off, start, bounds=judge.bounds(), xtol=1e-12, ftol=1e-12)
+    judge.sparing = way == "sparing"
+    if way == "by and by":
+        fit = judge.fit(("law",), start, 1)
+        for _ in range(14):
+            fit = judge.fit(("law",), fit, 1)
+    elif way == "from a fit":
+        fit = judge.fit(("law",), judge.fit(("law",), start, 2))
+    elif way == "with slopes":
+        free = judge.columns(("law",))
+        fit = judge.fit(("law",), start, 12, slopes=Known(free[1:], judge.linearise(start, free)[1][1:]))
+    else:
+        fit = judge.fit(("law",), start)
+    assert 2.0 * best.cost * (1.0 - 1e-9) <= judge.total_of(fit) <= 2.0 * best.cost + 1.2  # it ends near the end
+    assert fit.cost.sum() == pytest.approx(np.sum(judge.errors(fit.theta[None]) ** 2))
+    lead = judge.lead(("law",), start, 3)
+    assert lead.total == pytest.approx(judge.totals(judge.errors(lead.theta[None]), lead.theta[None])[0])
+    assert lead.total <= judge.totals(judge.errors(start[None]), start[None])[0]
+    assert judge.lead(("law",), start, 0).theta == pytest.approx(start)
+
+
+def test_a_step_simulates_its_slopes_once_and_its_trials_at_once() -> None:
+    asked: list[int] = []
+    judge = LeastSquaresProblem(decaying(1, 4.0, 1.0, asked), FLOOR[:1])
+    asked.clear()
+    start = np.array([1.0, 1.0, 0.5])
+    judge.lead(("law",), start, 1)
+    trials = asked[1]
+    assert asked == [4, trials] and trials >= 3  # at the start and a step of each parameter
+    asked.clear()
+    judge.fit(("law",), np.array([1.0, 1.1, 0.5]), 2)
+    assert asked == [4, trials, 3, trials, 3]  # where a fit ends its slopes are known
+    asked.clear()
+    fit = judge.fit(("law",), np.array([1.0, 4.0, 1.0]), 0)
+    assert asked == [4] and fit.theta.tolist() == [1.0, 4.0, 1.0]
+    judge.spared.add(0)  # a parameter that is spared since then has no slopes in the fit
+    less = judge.fit(("law",), fit, 8)
+    assert less.free.tolist() == [1, 2] and less.theta[0] == 1.0 and less.cost.sum() < fit.cost.sum()
+
+
+def test_carried_slopes_spare_simulations_and_lead_to_the_same_place() -> None:
+    many = []
+    for carries in (False, True):
+        asked: list[int] = []
+        judge = LeastSquaresProblem(decaying(2, 5.0, 1.5, asked, carries=carries), FLOOR[:1])
+        fit = judge.fit(("law",), np.array([1.0, 1.0, 0.5]), 30)
+        many.append((fit.theta, len(asked)))
+    assert many[0][0] == pytest.approx(many[1][0], abs=0.01)
+    short = LeastSquaresProblem(decaying(2, 5.0, 1.5, carries=True), FLOOR[:1])
+    assert carries_along(short, np.arange(3)) and not carries_along(
+        LeastSquaresProblem(decaying(2, 5.0, 1.5), FLOOR[:1]), np.arange(3)
+    )
+    edge = CARRIED_VALUES // N
+    assert carries_along(short, np.arange(edge)) and not carries_along(short, np.arange(edge + 1))
+
+
+def test_a_fit_is_gone_on_with_until_it_falls_no_more() -> None:
+    judge = LeastSquaresProblem(decaying(3, 6.0, 2.5), FLOOR[:1])
+    start = np.array([1.0, 0.2, 0.1])
+    first = judge.fit(("law",), start, 1)
+    (once,) = judge.together([finished(judge, judge.fitting(("law",), start, 1), False)])
+    (whole,) = judge.together([finished(judge, judge.fitting(("law",), start, 1))])
+    assert once.theta.tolist() == first.theta.tolist()
+    assert judge.total_of(whole) < 0.5 * judge.total_of(first)
+    assert judge.total_of(whole) == pytest.approx(judge.total_of(judge.fit(("law",), start, 60)), rel=1e-3)
+
+
+# ---- blocks, scales, slopes that are kept ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("window", "memory", "blocks"), [(2.0, 10.0, 12), (2.0, 5.0, 20), (30.0, 5.0, 3)])
+def test_a_block_is_so_many_windows_as_the_stage_s_memory_has(window: float, memory: float, blocks: int) -> None:
+    stage, _ = made(1, window=window, memory=memory)
+    judge = LeastSquaresProblem(stage, FLOOR)
+    assert judge.n_blocks == blocks
+    per = np.diff(np.append(judge.block_start, N)) * 0.5 / window
+    assert np.all(np.round(per[:-1]) == np.round(per[0]))
+
+
+def test_a_usual_change_is_that_of_the_tolerance_the_starts_or_the_value() -> None:
+    sizes = (
+        Parameter("given", 0.0, "1", scale=7.0), Parameter("started", 1.0, "1"), Parameter("near", 3.0, "1"),
+        Parameter("nothing", 0.0, "1"),
+    )  # fmt: skip
+    stage, _ = made(1)
+    stage.effects = (Effect("e", sizes, ((1.0, 1.0, 3.0, 0.0), (1.0, 3.0, 3.0, 0.0), (2.0, -4.0, 3.0, 0.0))),)
+    own = (Parameter("known", 0.0, "1", tolerance=0.5), Parameter("value", -4.0, "1"), Parameter("zero", 0.0, "1"))
+    stage.parameters = own
+    assert LeastSquaresProblem(stage, FLOOR).scale == pytest.approx([0.5, 4.0, 1.0, 7.0, 3.5, 3.0, 1.0])
+
+
+def test_how_samples_count_is_no_matter_of_their_size_or_of_lags_beyond_a_quarter_of_the_log() -> None:
+    fit: Any = SimpleNamespace(theta=np.zeros(1))
+    for n in (24, 60):
+        ramp = np.arange(float(n))
+        for scale in (1.0, 1e-7):
+            judge: Any = SimpleNamespace(errors=lambda _, e=scale * ramp: e[None, None])
+            row = ramp - ramp.mean()
+            rho = np.array([row[k:] @ row[: n - k] / (row @ row) for k in range(1, n // 4)])
+            assert correlation_of(judge, fit) == pytest.approx(1.0 + 2.0 * np.sum(rho**2))
+
+
+def test_what_is_known_beforehand_holds_an_interval_at_the_edge_of_a_tolerance() -> None:
+    """A gain that stands at its limit is as uncertain as its tolerance, and so is what trades with it."""
+    stage, x = made(5, sizes=(4.0, 2.0, 0.0))
+    x[1] = x[0] + 0.2 * x[1]  # the effect does nearly what the gain does
+    stage.measured = 4.0 * x[0] + 2.0 * x[1] + FLOOR[:, None] * np.random.default_rng(5).standard_normal((2, N))
+    judge = LeastSquaresProblem(stage, FLOOR)
+    fit = judge.fit(("a",), stage.neutral())
+    assert fit.theta[0] == 1.5 and fit.low[0] == fit.high[0] == 1.5
+    a = whitened(stage, x)[1][:, :2]
+    worth = min(1.0 / max(1.0, fit.cost.sum() / (2 * N)), EVIDENCE * 2 / (2 * N))
+    cov = np.linalg.inv(worth * a.T @ a + np.diag([12.0, 0.0]))
+    assert fit.high[1] - fit.theta[1] >= NINETY * np.sqrt(cov[1, 1]) * (1.0 - 1e-6)
+    assert np.all(np.abs(judge.correlation(fit)[1, 1]) <= 1.0)
+
+
+def test_so_many_slopes_are_kept() -> None:
+    kept, free = LatestSlopes(), np.array([0])
+    error = np.zeros((1, 1))
+    places = [np.array([float(k)]) for k in range(3)]
+    half = KEPT_SLOPES // 2
+    for place in places[:2]:
+        kept.put(place, free, error, np.broadcast_to(0.0, (1, 1, half)))
+    assert all(kept.of(p, free).fits(half) for p in places[:2])
+    kept.put(places[2], free, error, np.zeros((1, 1, 1)))
+    assert [kept.of(p, free).fits(n) for p, n in zip(places, (half, half, 1), strict=True)] == [False, True, True]
