@@ -17,6 +17,7 @@ from scipy.optimize import lsq_linear
 
 from tests.conftest import examples
 from vaneloop.identification import Effect, Parameter, Stage, StageError
+from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.onset import onset_of, that_begins
 from vaneloop.identification.results import StageDiagnosis, answer_of, found_of, rms_of
@@ -24,7 +25,7 @@ from vaneloop.identification.selection import diagnosis
 from vaneloop.identification.selection.diagnosis import EffectSelection, extend_stage, floor_of
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, _above_floor, as_close
 from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance
-from vaneloop.identification.selection.rules import BEGINS
+from vaneloop.identification.selection.rules import BEGINS, Comparison
 from vaneloop.identification.selection.screening import Linearisation, _best_within, _solved, followed
 from vaneloop.identification.selection.search import Search
 from vaneloop.identification.selection.subsampled_search import SubsampledSearch, _tried, spread
@@ -582,3 +583,160 @@ def test_what_the_excerpt_says_is_held_against_the_whole_log(monkeypatch: pytest
     assert search._known_promise(("z", "b"))[0] == np.inf and judge.roughly and search.ahead.judge.roughly
     pair = search.rivals(search.joined(("a", "c")), [("a", "b"), ("a", "c")], 1.0)
     assert [f.effects for f in pair] == [("a", "c")]  # b leaves far too much to be one
+
+
+# ---- where fits begin, and what is kept of them ----------------------------------------------------------------------
+
+
+def test_a_pair_begins_at_the_best_of_what_its_effects_had_alone_and_of_their_starts() -> None:
+    x = signals(20)
+    measured = with_noise(20, x, 1.1, 2.0, -1.5)
+    search = search_of(linear(x, measured, effects=tuple(effect(n, (-1.0, 0.5)) for n in "abc")))
+    judge, index = search.judge, search.stage.index()
+    singles = search.singles(["a", "b"])
+    (begins,) = judge.together([search._begins(("a", "b"))])
+    totals = []
+    for leave, rest in (("a", "b"), ("b", "a")):
+        for size in (search.starts[leave][0], singles[leave].theta):
+            theta = singles[rest].theta.copy()
+            theta[index[leave]] = size[index[leave]]
+            totals.append(judge.totals(judge.errors(theta[None]), theta[None])[0])
+    (led,) = begins
+    assert led.total == pytest.approx(min(totals)) and len(set(np.round(totals, 6))) == 4
+    assert judge.totals(judge.errors(led.theta[None]), led.theta[None])[0] == pytest.approx(led.total)
+    roams = search_of(linear(x, measured), RelativeErrorAcceptance)
+    for name in "ab":  # one start that leads nowhere: those of the effect are tried beside the other
+        roams.starts[name] = [roams.base.theta.copy()]
+    roams.fits[frozenset("a")] = roams.judge.fit(("a",), np.array([1.0, 1.0, 0.0, 0.0]))
+    (begins,) = roams.judge.together([roams._begins(("a", "b"))])
+    best = least(x, measured, [0, 1, 2])
+    assert len(begins) == 2 and [b.total for b in begins] == sorted(b.total for b in begins)
+    assert begins[0].total == pytest.approx(2.0 * best.cost, rel=1e-3)
+    nothing = roams.judge.errors(roams.base.theta[None])[0]
+    assert roams._left(frozenset(), nothing) == np.inf  # a size that changes nothing leads nowhere
+
+
+def test_the_reach_of_an_effect_is_what_its_largest_sizes_change() -> None:
+    x = signals(21, 2)
+    measured = with_noise(21, x, 1.1, 1.0)
+    search = search_of(linear(x, measured, effects=(effect("a", (1.0,)), effect("b", (3.0,)))))
+    base = search.base.cost.sum()
+    for k, (name, size) in enumerate((("a", 1.0), ("b", 3.0)), 1):
+        rest = (measured - size * x[k]).ravel() / FLOOR[0]
+        a = np.append(x[0].ravel() / FLOOR[0], PRIOR)[:, None]
+        left = np.linalg.lstsq(a, np.append(rest - search.base.theta[0] * a[:-1, 0], 0.0), rcond=None)[1][0]
+        assert search.reach[name] == pytest.approx(abs(left - base), rel=1e-5)
+    assert search.level["a"] < base < search.level["b"]
+
+
+def test_a_start_that_a_quick_fit_has_led_on_from_stays_with_the_others() -> None:
+    x = signals(22)
+    search = search_of(linear(x, with_noise(22, x, 1.1, 2.0)), RelativeErrorAcceptance)
+    starts = [search.base.theta + np.array([0.0, size, 0.0, 0.0]) for size in (9.0, 1.0, -4.0)]
+    search.starts["a"] = starts
+    (total,) = search.judge.together([search._followed("a")])
+    best = least(x, search.stage.measured, [0, 1])
+    assert total == pytest.approx(2.0 * best.cost, rel=1e-4) and len(search.starts["a"]) == 3
+    assert search.starts["a"][0][:2] == pytest.approx(best.x, abs=1e-2)
+    assert [s[1] for s in search.starts["a"][1:]] == [-4.0, 9.0]  # by what is left there
+
+
+@pytest.mark.parametrize("side", [0.999, 1.001])
+@pytest.mark.parametrize("correlation", [1.0, 3.0])
+def test_an_effect_shows_that_could_change_the_squares_by_twice_the_nats(side: float, correlation: float) -> None:
+    criterion = LikelihoodAcceptance(SimpleNamespace())  # type: ignore[arg-type]
+    criterion.correlation = correlation
+    assert criterion.shows(side * 2.0 * NATS * correlation) == (side > 1.0)
+
+
+def test_how_much_errors_are_alike_is_learnt_from_the_best_fit() -> None:
+    x = signals(23, 0)
+    e = x[0, 0].copy()
+    for i in range(1, N):
+        e[i] += 0.8 * e[i - 1]
+    stage = linear(signals(24), signals(24)[0] + FLOOR[0] * e[None])
+    judge = problem(stage)
+    criterion = LikelihoodAcceptance(judge)
+    fit = judge.fit((), stage.neutral())
+    criterion.learn(fit)
+    assert criterion.correlation == correlation_of(judge, fit) > 2.0
+    assert criterion.gain(fit, fit) == (0.0, 0.0)
+    other = replace(fit, held_out=0.5 * fit.held_out)
+    assert criterion.gain(fit, other)[0] == pytest.approx(0.25 * fit.held_out.sum() / criterion.correlation)
+    assert Comparison(judge, fit, other).gain[0] == pytest.approx(0.25 * fit.held_out.sum())
+
+
+def test_two_effects_that_help_only_together_are_tried_with_the_leader() -> None:
+    x = signals(25)
+    x[1], x[2] = x[1] + 0.1 * x[2], -x[1] + 0.1 * x[2]
+    measured = with_noise(25, x, 1.0, 10.0, 10.0)
+    search = search_of(linear(x, measured), RelativeErrorAcceptance)
+    singles = search.singles(["a", "b", "c"])
+    assert not any(search.criterion.accepts(search.base, f) for f in singles.values())
+    for first in "ab":
+        ranked = [first, "c"]
+        choice = EffectSelection(search, singles, ranked, [])
+        found = choice.finalists(search.base)
+        assert frozenset("ab") in {frozenset(f.effects) for f in found}
+        assert choice.chosen(search.base, choice.accepted(search.base, found)).effects in (("a", "b"), ("b", "a"))
+
+
+def test_a_pair_is_taken_where_the_best_single_fails_and_the_rules_accept_it() -> None:
+    one: Any = SimpleNamespace(effects=("a",), held_out=np.ones(4))
+    pair: Any = SimpleNamespace(effects=("a", "b"), held_out=np.ones(4))
+    for fails, accepts in ((True, True), (True, False), (False, True), (False, False)):
+        criterion: Any = SimpleNamespace(
+            order=lambda f: len(f.effects), fails=lambda f, fails=fails: fails, accepts=lambda b, f, ok=accepts: ok
+        )
+        search: Any = SimpleNamespace(
+            criterion=criterion, judge=SimpleNamespace(n=4), stage=SimpleNamespace(effects=(effect("a"), effect("b")))
+        )
+        choice = EffectSelection(search, {}, [], [])
+        assert choice.chosen(one, [pair, one]) is (pair if fails and accepts else one)
+
+
+def test_what_is_not_needed_in_the_end_is_told_as_a_step() -> None:
+    x = signals(26)
+    search = search_of(linear(x, with_noise(26, x, 1.1, 2.0, 0.0, 1.5)))
+    singles = search.singles(["a", "b", "c"])
+    steps: list[tuple[str, float]] = []
+    choice = EffectSelection(search, singles, ["a", "c", "b"], steps)
+    *_, last = choice.pruned([search.base, search.joined(("a", "b", "c"))])
+    assert last.effects == ("a", "c") and steps == [("a + c", rms_of(search.judge, last))]
+
+
+@pytest.mark.parametrize("side", [0.95, 1.05])
+def test_an_effect_is_exchanged_for_one_that_is_better_by_two_per_cent(side: float) -> None:
+    judge = SimpleNamespace(
+        n=400, samples=np.full(4, 100), stage=SimpleNamespace(grain=1.0, effects=(effect("a"), effect("b")))
+    )
+
+    def fit(name: str, error: float, free: int = 2) -> Any:
+        return SimpleNamespace(effects=(name,), held_out=np.full(4, 100.0 * error**2), free=np.arange(free))
+
+    criterion: Any = RelativeErrorAcceptance(judge)  # type: ignore[arg-type]
+    mine, other = fit("a", 5.0), fit("b", 5.0 * np.exp(-side * 0.02))
+    search: Any = SimpleNamespace(best_of=lambda sets: [other] if sets[0][-1] == "b" else [mine], pruned=lambda f: f)
+    assert criterion._swapped(search, mine, ["a", "b"]) is (other if side > 1.0 else mine)
+    other.free, criterion.accepts = np.arange(3), lambda before, after: False
+    other.held_out *= 0.8
+    assert criterion._swapped(search, mine, ["a", "b"]) is mine  # one that is freer must be worth it
+    criterion.accepts = lambda before, after: True
+    assert criterion._swapped(search, mine, ["a", "b"]) is other
+
+
+def test_a_pair_of_an_excerpt_follows_to_the_whole_log_and_is_no_worse_than_its_part(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    search = ahead(27, (1.4, 3.0, 0.0, 1.0), monkeypatch)
+    judge = search.judge
+    ticks: list[int] = []
+    search.ahead.tick = lambda: ticks.append(1)
+    search.ahead.judge.together([search.ahead._quick("a")])
+    assert len(ticks) == 1
+    rough = search._rough(search.ahead.joined(("a", "c")))
+    assert judge.block_costs(judge.errors(rough.theta[None]))[0] == pytest.approx(rough.cost, rel=1e-9)
+    alone = search.single("a")
+    search.fits[frozenset("ab")] = replace(search.base, effects=("a", "b"))
+    (pair,) = judge.together([search._from(replace(search.base, effects=("a", "b")))])
+    assert judge.total_of(pair) <= judge.total_of(alone)
