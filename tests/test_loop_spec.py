@@ -19,7 +19,7 @@ from controller.records import as_inputs
 from hil.bus.frames import PAUSE, R_LAST, R_LAST_TICK
 from hil.logs import Channel, Log, write_log
 from hil.logs.plausible import LONGEST
-from hil.loop import lanes, lockstep, realtime, tick
+from hil.loop import engines, lanes, lockstep, realtime, tick
 from hil.loop.ecu import BUILTIN, Demand, EcuStation, Typed, builtin, demand_of_log, read_profile
 from hil.loop.lockstep import Run, Stimulus, columns_of, snapshot_names, to_border
 from hil.loop.realtime import Lateness, Report, Stop, Ticker, packed, run_realtime, stop_on_signals
@@ -706,3 +706,209 @@ def test_frames_that_come_late_or_are_held_are_those_of_before() -> None:
     ):
         a = loop_of(**effects)
         assert [arrive(10 * i, a, float(i)) for i in range(12)] == expected, effects
+
+
+# ---- what a run asks of the system -----------------------------------------------------------------------------------
+
+
+class System:
+    """Stands in for what a process asks of Linux, and notes it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, locks: int = 0, slack: int = 50_000):
+        self.asked: list[tuple[Any, ...]] = []
+
+        def note(name: str, answer: Any = 0) -> Any:
+            return lambda *given: self.asked.append((name, *given)) or answer
+
+        self.policy = realtime.os.SCHED_OTHER
+        libc = SimpleNamespace(
+            prctl=note("prctl", slack), mlockall=note("mlockall", locks), munlockall=note("munlockall"),
+            syscall=lambda number, pid, attr, flags: self.asked.append(("slice", struct.unpack("IIQiIQQQ", attr))),
+        )  # fmt: skip
+        monkeypatch.setattr(realtime, "_libc", libc)
+        monkeypatch.setattr(realtime, "_SCHED_SETATTR", 314)
+        monkeypatch.setattr(realtime.ctypes, "get_errno", lambda: 1)
+        for name, answer in (
+            ("sched_getaffinity", {0, 1}), ("sched_getparam", "parameters"), ("getpriority", 5),
+            ("sched_setaffinity", None), ("sched_setscheduler", None),
+        ):  # fmt: skip
+            monkeypatch.setattr(realtime.os, name, note(name, answer))
+        monkeypatch.setattr(realtime.os, "sched_getscheduler", lambda pid: self.policy)
+
+    def of(self, name: str) -> list[tuple[Any, ...]]:
+        return [given[1:] for given in self.asked if given[0] == name]
+
+
+def test_what_a_run_asks_of_the_system_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    system = System(monkeypatch)
+    with realtime.undisturbed(priority=40, cpu=1) as notes:
+        assert notes == [] and system.of("mlockall") == [(1 | 2 | 4,)]  # now, later, and only once it is used
+        assert system.of("prctl") == [(30, 0, 0, 0, 0), (29, 1, 0, 0, 0)]  # timers as exact as they can be
+        assert system.of("sched_setaffinity") == [(0, {1})]
+        ((pid, policy, parameters),) = system.of("sched_setscheduler")
+        assert (pid, policy, parameters.sched_priority) == (0, realtime.os.SCHED_FIFO, 40)
+        assert system.of("slice") == [((48, realtime.os.SCHED_OTHER, 0, 5, 0, 100_000, 0, 0),)]  # 0.1 ms
+        system.asked.clear()
+    assert system.asked == [
+        ("munlockall",), ("prctl", 29, 50_000, 0, 0, 0),
+        ("sched_setscheduler", 0, realtime.os.SCHED_OTHER, "parameters"),
+        ("getpriority", realtime.os.PRIO_PROCESS, 0), ("slice", (48, realtime.os.SCHED_OTHER, 0, 5, 0, 0, 0, 0)),
+        ("sched_setaffinity", 0, {0, 1}),
+    ]  # fmt: skip
+
+
+def test_what_the_system_does_not_give_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    import gc
+
+    system = System(monkeypatch, locks=-1, slack=0)
+    gc.disable()
+    try:
+        with realtime.undisturbed() as notes:
+            assert notes == ["memory is not locked (Operation not permitted); ulimit -l or root allows it"]
+            assert system.of("sched_setaffinity") == system.of("sched_setscheduler") == []
+        assert not gc.isenabled()  # it was off before
+    finally:
+        gc.enable()
+    assert system.of("prctl")[-1] == (29, 1, 0, 0, 0) and len(system.of("slice")) == 2
+    system.asked.clear()
+    system.policy = realtime.os.SCHED_FIFO  # which has no turns
+    realtime._ask_for_slice(100)
+    monkeypatch.setattr(realtime, "_SCHED_SETATTR", None)
+    system.policy = realtime.os.SCHED_OTHER
+    realtime._ask_for_slice(100)
+    assert system.of("slice") == []
+
+
+# ---- engines on a GPU, which stands still here -----------------------------------------------------------------------
+
+
+class OnDevice(np.ndarray):
+    """An array that is its own copy on the GPU."""
+
+    def copy_to_host(self) -> np.ndarray:
+        return np.array(self)
+
+
+class Kernel:
+    """Notes how it is called; each call puts what it has counted where the figures are."""
+
+    name = "stand-in"
+    cuda = SimpleNamespace(to_device=lambda a: np.ascontiguousarray(a).copy().view(OnDevice))
+
+    def __init__(self) -> None:
+        self.calls: list[Any] = []
+        self.arrays: list[Any] = []
+
+    def __call__(self, n: int, k0: int, ticks: int, every: int, last: int, noise: Any, *arrays: Any) -> None:
+        self.calls.append((n, k0, ticks, every, last, noise.shape))
+        self.arrays, self.noise = list(arrays), noise
+        found = arrays[-1]
+        found[:] = np.arange(len(found))[:, None] + 0.25 * np.arange(n)
+        found[engines.gpu.LAST_MODE], found[engines.gpu.LOST] = 2.0, np.arange(n) % 2
+
+    def room(self, each: int, share: float, most: int) -> int:
+        assert each > 0 and share == 0.8 and most == 1 << 17
+        return 2
+
+
+def test_engines_go_to_the_gpu_in_groups_that_can_stand_side_by_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    motor = build_plant()
+    motor.p[engines.KIND, 0] = 1.0
+    plants = [PLANT, build_plant(), motor, PLANT, PLANT]
+    cals = [CAL, CAL, CAL, load_calibration(strategy="inverse"), CAL]
+    work = engines._Work([Stimulus.of(60.0)] * 5, plants, cals, None, 10, 30)
+    groups = [some.tolist() for some in work.for_gpu(Kernel(), None)]  # type: ignore[arg-type]
+    assert sorted(i for of in groups for i in of) == [0, 1, 4] and max(map(len, groups)) <= 2
+    assert [some.tolist() for some in work.for_gpu(Kernel(), 1)] == [[i] for of in groups for i in of]  # type: ignore[arg-type]
+    assert not work.out.ran.any() and work.out.simulated_s == pytest.approx(0.03)
+    assert np.isnan(work.out.angle_error).all() and work.out.angle_error.shape == (5, len(PLANT.vanes))
+
+
+@pytest.mark.parametrize("seed", [None, 7])
+def test_engines_on_a_gpu_begin_at_rest_and_their_figures_come_back_in_the_border_s_units(seed: int | None) -> None:
+    kernel: Any = Kernel()
+    loud = flashed_plant()
+    plants, cals = [PLANT, PLANT, loud], [CAL, CAL, CAL]
+    stimuli = [Stimulus.of(np.full(1500, 60.0)), Stimulus.of(np.full(1500, 80.0)), Stimulus.of(np.full(1500, 60.0))]
+    work = engines._Work(stimuli, plants, cals, seed, 20, 15_000)
+    engines._on_gpu(kernel, work, np.arange(3))
+    warm = lockstep.WARM_UP
+    stages = len(PLANT.vanes)
+    assert kernel.calls == [
+        (3, -warm, warm, 20, 14_980, (1, 2 + stages)), (3, 0, 10_000, 20, 14_980, (10_000 if seed else 1, 2 + stages)),
+        (3, 10_000, 5000, 20, 14_980, (5000 if seed else 1, 2 + stages)),
+    ]  # fmt: skip
+    if seed is not None:
+        again = np.random.Generator(np.random.PCG64(seed))
+        again.standard_normal((10_000, 2 + stages))
+        np.testing.assert_array_equal(kernel.noise, again.standard_normal((5000, 2 + stages)))
+    rows, which, sigma, own, scalars, tables, angles, schedule, s, p, z, found = kernel.arrays
+    assert which.tolist() == [0, 1, 2] and own.tolist() == [0, 0, 1] and rows.shape == (3, 1500, rows.shape[2])
+    assert sigma.any() == (seed is not None) and sigma.shape == (2 + stages, 3) and len(tables) == len(angles) == 2
+    np.testing.assert_array_equal(p[:, 0], PLANT.p[: engines.gpu.P_ROWS, 0])
+    for j, n in enumerate((60.0, 80.0, 60.0)):
+        table = tables[own[j]]
+        assert s[places.X, j] == pytest.approx(tick.mean_stroke(table, n)) and s[places.N_R, j] == n
+    assert schedule.shape == (1 + stages, schedule.shape[1]) and z.shape == (engines.gpu.Z_ROWS, 3)
+    out, gpu = work.out, engines.gpu
+    each = 0.25 * np.arange(3)
+    np.testing.assert_allclose(out.servo_error, 1e3 * (gpu.SERVO + each))
+    np.testing.assert_allclose(out.stroke, 1e3 * (gpu.LAST_STROKE + each))
+    np.testing.assert_allclose(out.angles[:, 1], np.degrees(gpu.ANGLE_LAST + 1 + each))
+    np.testing.assert_allclose(out.angle_error[:, 0], np.degrees(gpu.ANGLE_ERROR + each))
+    np.testing.assert_allclose(out.in_mode[:, 0], (gpu.SAMPLES + each) * 0.02)
+    assert out.mode.tolist() == [2, 2, 2] and out.finite.tolist() == [True, False, True] and out.ran.all()
+    assert out.devices == ["stand-in"] and out.on.tolist() == [0, 0, 0]
+    assert found.shape == (gpu.FOUND, 3) and not isinstance(scalars, gpu.Scalars)
+    alone: Any = Kernel()
+    engines.put_on_gpu(alone, [PLANT], [CAL], stimuli[:1], seed)
+    one = engines.put_on_gpu(alone, [PLANT, PLANT], [CAL, CAL], stimuli[:2], seed)
+    assert isinstance(one[4], gpu.Scalars) and one[4].kp == CAL.scalars.kp  # one calibration is no array
+
+
+def flashed_plant() -> Any:
+    return Model(effects={"controller_gain_error": {"factor": 1.2}}).plant(PLANT)
+
+
+def test_a_gpu_is_asked_first_and_the_processor_runs_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[int] = []
+    ran: list[list[int]] = []
+
+    def finished(kernel: Any, work: Any, some: Any) -> None:
+        ran.append(some.tolist())
+        work.ran_on("gpu" if kernel else "cpu", some)
+
+    monkeypatch.setattr(engines, "_on_gpu", finished)
+    monkeypatch.setattr(engines, "_on_processor", lambda work, some: finished(None, work, some))
+    monkeypatch.setattr(engines.gpu, "kernel", Kernel)
+    monkeypatch.setattr(engines, "threads", lambda: 1)
+    monkeypatch.setattr(engines, "AT_ONCE", 2)
+    plants = [PLANT] * 3
+    out = engines.lockstep_engines(Stimulus.of(60.0), plants, device="auto", at_once=2, progress=done.append)
+    assert ran == [[0, 1], [2]] and done == [2, 3] and out.devices == ["gpu"] and out.wall_s > 0.0
+    ran.clear(), done.clear()
+    cals = [load_calibration(strategy="inverse"), CAL, load_calibration(strategy="inverse")]
+    out = engines.lockstep_engines(Stimulus.of(60.0), plants, calibrations=cals, progress=done.append)
+    assert ran == [[1], [0, 2]] and done == [1, 3] and out.on.tolist() == [1, 0, 1]
+    ran.clear(), done.clear()
+    out = engines.lockstep_engines(Stimulus.of(60.0), plants, device="cpu", progress=done.append)
+    assert ran == [[0, 1], [2]] and done == [2, 3] and out.devices == ["cpu"]
+    engines.lockstep_engines(Stimulus.of(60.0), plants, device="cpu")
+
+
+# ---- where a run begins ----------------------------------------------------------------------------------------------
+
+
+def test_a_controller_that_is_heard_in_the_first_tick_is_met_then() -> None:
+    s = station(0, Demand(np.array([0.0, 0.02]), np.array([60.0, 64.0])))
+    s.tick(NO, 0)
+    assert s.met == 0 and s.t == pytest.approx(1e-3)
+
+
+def test_play_begins_where_the_machine_s_was() -> None:
+    stimulus = Stimulus.of(np.full(3, 60.0))
+    plain = lockstep.lockstep(stimulus)
+    start = np.radians([plain.columns[v][0] for v in VANES[: len(PLANT.vanes)]])
+    moved = [lockstep.lockstep(stimulus, angles=tuple(start + side * 1e-3)) for side in (-1.0, 1.0)]
+    first = [[run.columns[v][0] for v in VANES[: len(PLANT.vanes)]] for run in moved]
+    assert np.all(np.array(first[1]) >= np.array(first[0])) and first[0] != first[1]

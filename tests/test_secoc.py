@@ -25,12 +25,13 @@ from hil.logs.recorder import Recorder
 from hil.logs.recordings import read_record
 from hil.loop.node import Ecu, Node
 from hil.loop.realtime import TICK_NS, run_realtime
-from hil.loop.secured import BEHIND, DEMANDED, FROM_CONTROLLER, HOLD, MOST_WAITING, Gate, Secured, started
+from hil.loop.secured import DEMANDED, FROM_CONTROLLER, Gate, Secured, started
 from vaneloop.base.errors import InputError
 from vaneloop.cli.main import main
 
 pytest.importorskip("cryptography")
 
+HOLD, MOST_WAITING, BEHIND = 50, 16, 100  # ticks, frames, ms
 KEY = bytes.fromhex("2b7e151628aed2a6abf7158809cf4f3c")  # of RFC 4493
 NONE = np.zeros((0, 2), np.int64)
 START = 1_700_000_000_000  # ms since 1970
