@@ -146,8 +146,8 @@ NEAREST = {
     ),
     **dict.fromkeys(
         OWN_MODELS,
-        "user_models_spec unmodelled_spec curve_choice_spec experiment_own laws own_laws hidden_law learn learn_beside "
-        "learn_confirmed "
+        "user_models_spec unmodelled_spec curve_choice_spec curves_in_place_spec experiment_own laws own_laws "
+        "hidden_law learn learn_beside learn_confirmed "
         "learn_creep learn_differences learn_faint learn_followers learn_lags learn_periods learn_screening "
         "learn_slopes learn_speed learn_stops learn_surfaces learn_turns learn_two learn_vanes promise spikes "
         "starts your_own_model kept held",
