@@ -16,13 +16,16 @@ import pytest
 
 from controller import load_calibration
 from controller.records import as_inputs
+from hil.bus import frames
 from hil.bus.frames import PAUSE, R_LAST, R_LAST_TICK
 from hil.logs import Channel, Log, write_log
 from hil.logs.plausible import LONGEST
 from hil.loop import engines, lanes, lockstep, realtime, tick
 from hil.loop.ecu import BUILTIN, Demand, EcuStation, Typed, builtin, demand_of_log, read_profile
+from hil.loop.heard_lanes import noise_of
 from hil.loop.lockstep import Run, Stimulus, columns_of, snapshot_names, to_border
 from hil.loop.realtime import Lateness, Report, Stop, Ticker, packed, run_realtime, stop_on_signals
+from hil.loop.secured import run_secured
 from hil.loop.tick import KEPT, new_loop
 from plant import Model, build_plant, places
 from vaneloop.base.errors import InputError
@@ -912,3 +915,116 @@ def test_play_begins_where_the_machine_s_was() -> None:
     moved = [lockstep.lockstep(stimulus, angles=tuple(start + side * 1e-3)) for side in (-1.0, 1.0)]
     first = [[run.columns[v][0] for v in VANES[: len(PLANT.vanes)]] for run in moved]
     assert np.all(np.array(first[1]) >= np.array(first[0])) and first[0] != first[1]
+
+
+def test_a_run_begins_at_its_first_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    stimulus = Stimulus.of(np.array([61.0, 75.0]), np.array([55.0, 70.0]))
+    stimulus.rows[:, lockstep.S_T_OIL] = 50.0, 80.0
+    asked: list[dict[str, Any]] = []
+
+    class Done(Exception):
+        pass
+
+    def begun(plant: Any, calibration: Any, **given: Any) -> Any:
+        asked.append(given)
+        raise Done
+
+    monkeypatch.setattr(lockstep, "new_loop", begun)
+    for seed, n_r in ((3, 55.0), (None, np.nan)):
+        stimulus.rows[0, lockstep.S_N_R] = n_r
+        with pytest.raises(Done):
+            lockstep.lockstep(stimulus, seed=seed)
+    assert asked[0] == {"n_engine": 61.0, "n_r": 55.0, "t_oil": 50.0, "noisy": True, "pots": None}
+    assert (asked[1]["n_r"], asked[1]["noisy"]) == (61.0, False)  # without a speed it turns as demanded
+
+
+def test_the_loop_is_compiled_once_and_the_user_told_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    ran: list[int] = []
+    monkeypatch.setattr(lockstep, "lockstep", lambda stimulus: ran.append(len(stimulus.rows)))
+    monkeypatch.setattr(lockstep, "is_cached", lambda function: True)
+    lockstep.warm_up(said.append)
+    assert said == [] and ran == []
+    monkeypatch.setattr(lockstep, "is_cached", lambda function: False)
+    lockstep.warm_up(said.append)
+    assert ran == [10] and said[0].startswith("compiling the simulator for this machine (once") and len(said) == 2
+    assert said[1] == "compiled in 0 s"
+
+
+def test_each_loop_in_lanes_has_its_share_of_the_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([5.0, 11.0, 20.0, 26.0])
+    monkeypatch.setattr(lanes.time, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(lanes, "Lanes", lambda loops, stimuli, way, every: len(loops))
+    monkeypatch.setattr(lanes, "_run", lambda n, ticks, seed: [Run({}, ticks * 1e-3, 0.0, "", 4) for _ in range(n)])
+    monkeypatch.setattr(lanes, "on_all_cores", lambda run, parts: [run(part) for part in parts])
+    (one,) = lanes.lockstep_lanes(Stimulus.of(np.full(3, 60.0)), [PLANT])
+    assert (one.wall_s, one.simulated_s, one.faults) == (6.0, 0.03, 4)
+    assert [r.wall_s for r in lanes.lockstep_lanes(Stimulus.of(np.full(3, 60.0)), [PLANT] * 3)] == [2.0] * 3
+
+
+@pytest.mark.parametrize(("ticks", "words"), [(30, 3), (31, 4), (1, 1)])
+def test_noise_of_a_bus_is_a_row_a_tick_and_a_number_a_frame(ticks: int, words: int) -> None:
+    sensors, speed = noise_of(7, ticks, 3)
+    assert sensors.shape == (ticks, 5) and speed.shape == (words,)
+    np.testing.assert_array_equal(sensors, np.random.Generator(np.random.PCG64(7)).standard_normal((ticks, 5)))
+    np.testing.assert_array_equal(speed, np.random.Generator(np.random.PCG64(8)).standard_normal(words))
+
+
+def test_figures_of_engines_on_the_processor_are_those_of_their_logs(monkeypatch: pytest.MonkeyPatch) -> None:
+    n = 4
+    vanes = PLANT.vanes
+
+    def run_of(k: int) -> Run:
+        columns = {
+            "n_r": np.full(n, 70.0), "x_dem": np.array([1.0, 2.0, 3.0, 4.0]),
+            "x_lvdt": np.array([1.0, 2.5, 2.9, 4.2 + k]), "state": np.array([0.0, 1.0, 1.0, 2.0]),
+            **{v: np.degrees(PLANT.schedules.targets(np.full(n, 70.0))[:, q]) + 0.1 * (q + 1) * np.arange(n)
+               for q, v in enumerate(vanes)},
+        }  # fmt: skip
+        return Run(columns, 0.04, 0.0, "", 8 + k)
+
+    def runs(stimuli: Any, plants: Any, **given: Any) -> list[Run]:
+        assert given["every"] == 10 and given["duration"] == pytest.approx(0.04) and given["seed"] == 5
+        if any(p is away for p in plants):
+            raise InputError("runs away")
+        return [run_of(0) for _ in plants]
+
+    away = build_plant()
+    monkeypatch.setattr(engines, "lockstep_lanes", runs)
+    work = engines._Work([Stimulus.of(60.0)] * 3, [PLANT, away, PLANT], [CAL] * 3, 5, 10, 40)
+    engines._on_processor(work, np.arange(3))
+    out = work.out
+    assert out.finite.tolist() == [True, False, True] and out.ran.all() and out.devices == ["cpu"]
+    assert out.servo_error[0] == pytest.approx(0.5) and out.stroke[0] == 4.2 and out.mode[0] == 2 and out.faults[0] == 8
+    assert out.angle_error[0, : len(vanes)] == pytest.approx(0.3 * np.arange(1, len(vanes) + 1))
+    last = np.degrees(PLANT.schedules.targets(np.full(1, 70.0))[0]) + 0.3 * np.arange(1, len(vanes) + 1)
+    assert out.angles[0, : len(vanes)] == pytest.approx(last)
+    assert out.in_mode[0, :3] == pytest.approx([0.01, 0.02, 0.01]) and out.servo_error[1] == 0.0
+
+
+def test_a_secured_run_gives_what_was_taken_and_sent_tick_by_tick() -> None:
+    class Silent:
+        """A node that sends one frame every third tick, and notes what it hears."""
+
+        def __init__(self, head: int) -> None:
+            self.head, self.node, self.k, self.heard, self.asked = head, self, 0, [], []
+
+        def set_demand(self, n_dem: float, n_r: float) -> None:
+            self.asked.append((n_dem, n_r))
+
+        def tick(self, rows: np.ndarray) -> np.ndarray:
+            self.heard.append(len(rows))
+            self.k += 1
+            return np.array([[self.head, self.k]] if self.k % 3 == 1 else np.zeros((0, 2)), np.int64).reshape(-1, 2)
+
+    heads = [int(frames.word0(i)) for i in (frames.ECU_DEMAND, frames.VGV_STATUS)]
+    ecu, vgv = Silent(heads[0]), Silent(heads[1])
+    profile = np.array([[60.0, 50.0], [61.0, 51.0]])
+    told: list[float] = []
+    got = run_secured(profile, vgv, ecu, start=99, duration=0.03, progress=told.append)  # type: ignore[arg-type]
+    assert got.run.simulated_s == pytest.approx(0.03) and told == [0.0] and got.run.frames == 20
+    assert ecu.asked == [(60.0, 50.0)] * 10 + [(61.0, 51.0)] * 20
+    assert got.sent_at.tolist() == list(range(0, 30, 3)) and got.sent[:, 0].tolist() == [heads[1]] * 10
+    assert got.taken_at[0] == 0 and got.taken[0].tolist() == [frames.FRESHNESS, 99]
+    assert got.taken_at[1:].tolist() == list(range(1, 30, 3)) and got.taken[1:, 0].tolist() == [heads[0]] * 10
+    assert ecu.heard[0] == 1 and vgv.heard[:3] == [1, 1, 0] and got.run.error_frames == 0
