@@ -740,3 +740,193 @@ def test_a_pair_of_an_excerpt_follows_to_the_whole_log_and_is_no_worse_than_its_
     search.fits[frozenset("ab")] = replace(search.base, effects=("a", "b"))
     (pair,) = judge.together([search._from(replace(search.base, effects=("a", "b")))])
     assert judge.total_of(pair) <= judge.total_of(alone)
+
+
+# ---- what an excerpt says, on the whole log --------------------------------------------------------------------------
+
+
+def excerpt_said(stage: Stage, rows: slice, effects: tuple[str, ...]) -> tuple[StageDiagnosis, LeastSquaresProblem]:
+    """The answer of a part of the log with these effects, whether they are there or not."""
+    run = stage.run
+    part = replace(
+        stage,
+        t=stage.t[rows],
+        measured=stage.measured[:, rows],
+        run=lambda thetas: run(thetas)[..., rows],
+        excerpt=None,
+    )
+    judge = problem(part)
+    base, fit = (judge.fit(e, part.neutral()) for e in ((), effects))
+    found = found_of(judge, fit, effects, dict.fromkeys(effects, base))
+    for f in found:
+        f.rivals, f.nats = ["r"], 77.0
+    return answer_of(judge, "missing", base, fit, found, []), judge
+
+
+@pytest.mark.parametrize(
+    ("sizes", "kept"), [((2.0, 0.0, 1.5), ("a", "c")), ((2.0, 1.0, 1.5), ("a", "b", "c")), ((0.0, 0.0, 0.0), ())]
+)
+def test_what_the_whole_log_does_not_need_goes(sizes: tuple[float, ...], kept: tuple[str, ...]) -> None:
+    x = signals(30, n=600)
+    stage = linear(x, with_noise(30, x, 1.1, *sizes))
+    said, _ = excerpt_said(stage, slice(0, 150), ("a", "b", "c"))
+    judge = problem(stage)
+    base = judge.fit((), stage.neutral())
+    found = diagnosis._confirm(stage, None, stage.floor, base, said, LikelihoodAcceptance)  # type: ignore[arg-type]
+    columns = [0, *(1 + "abc".index(n) for n in kept)]
+    best = least(x, stage.measured, columns)
+    assert found.final.effects == kept and found.final.theta[columns] == pytest.approx(best.x, abs=1e-4)
+    assert [f.effect for f in found.effects] == list(kept) and found.verdict == ("missing" if kept else "none")
+    assert found.base is base and found.correlation == correlation_of(judge, found.final)
+    names = [s[0] for s in found.steps]
+    assert names == (["nominal", " + ".join(kept)] if kept else ["nominal"])
+    assert found.steps[0][1] == rms_of(judge, base) and found.steps[-1][1] == rms_of(judge, found.final)
+    for f in found.effects:
+        assert f.parameters[f"{f.effect}0"]["value"] == found.final.theta[1 + "abc".index(f.effect)]
+        rest = least(x, stage.measured, [c for c in columns if c != 1 + "abc".index(f.effect)])
+        assert f.fall == pytest.approx(np.sqrt(rest.cost / best.cost), rel=0.05)
+        assert f.rivals == ["r"] and f.nats == 77.0  # as the excerpt has them
+    lower = replace(said, floor=0.99 * FLOOR[:1])
+    again = diagnosis._confirm(stage, None, stage.floor, base, lower, LikelihoodAcceptance)  # type: ignore[arg-type]
+    assert again.base is not base and again.floor[0] == pytest.approx(0.99 * FLOOR[0])
+
+
+@pytest.mark.parametrize(
+    ("answers", "asked"),
+    [
+        ([("missing", "missing")], 1), ([("unknown", "unknown")], 1), ([("none", "none")], 1),
+        ([("missing", "unknown"), ("missing", "missing")], 2), ([("missing", "unknown"), ("missing", "unknown")], 2),
+    ],
+)  # fmt: skip
+def test_a_second_excerpt_is_taken_where_the_whole_log_shows_more(
+    answers: list[tuple[str, str]], asked: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of each excerpt what it says, and what the whole log makes of that."""
+    x = signals(31, n=400)
+    stage = linear(x, with_noise(31, x, 1.1))
+    run = stage.run
+    stage.excerpt = lambda at: replace(
+        stage, t=stage.t[at], measured=stage.measured[:, at], run=lambda thetas: run(thetas)[..., at], excerpt=None
+    )
+    monkeypatch.setattr(diagnosis, "LONG_SAMPLES", 400)
+    left: list[Any] = []
+    finals = [object(), object()]
+
+    def excerpt(judge: Any, fit: Any, piece: int, samples: int) -> Array:
+        left.append(fit)
+        assert (piece, samples) == (4000, 40_000)
+        return np.arange(0, 400, 2)
+
+    told = iter(answers)
+    whole: list[str] = []
+
+    def whenever(part: Stage, own: Any, judged: Any, ask: Any) -> Any:
+        one, other = next(told)
+        whole.append(other)
+        assert len(part.t) == 200 and (own is None or own.shape == (200,))
+        return SimpleNamespace(verdict=one)
+
+    def confirm(*given: Any) -> Any:
+        return SimpleNamespace(verdict=whole[-1], final=finals[len(whole) - 1], effects=[], nearest=[])
+
+    monkeypatch.setattr(diagnosis, "excerpt_of", excerpt)
+    monkeypatch.setattr(diagnosis, "_whenever", whenever)
+    monkeypatch.setattr(diagnosis, "_confirm", confirm)
+    for keep in (None, np.ones(400, dtype=bool)):
+        left.clear(), whole.clear()
+        told = iter(answers)
+        d = diagnosis.diagnose_stage(stage, FLOOR[:1], keep)
+        assert d.verdict == answers[asked - 1][1] and len(whole) == asked
+        assert left[0] is None and len(left) == asked + 1 and isinstance(left[1], Fit)
+        if asked == 2:
+            assert left[2] is finals[0]  # where the first answer fails most
+    stage.t = stage.t[:399]  # one sample fewer is searched whole
+    told = iter([("none", "none")])
+    monkeypatch.setattr(diagnosis, "_whenever", lambda *_: SimpleNamespace(verdict="whole", effects=[], nearest=[]))
+    assert diagnosis.diagnose_stage(stage, FLOOR[:1]).verdict == "whole"
+
+
+def test_a_better_nominal_model_that_the_search_found_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+    x = signals(32)
+    stage = linear(x, with_noise(32, x, 1.1, 2.0))
+    for better in (False, True):
+
+        def found(search: Search, better: bool = better) -> Any:
+            if better:
+                search.base = replace(search.base, held_out=0.25 * search.base.held_out)
+            return search, search.single("a"), [], [("nominal", 1.0)]
+
+        monkeypatch.setattr(diagnosis, "_search", found)
+        d = diagnosis._to_the_floor(stage, FLOOR[:1], None, None, LikelihoodAcceptance)
+        was = rms_of(problem(stage), d.base)
+        says = (
+            f"with nothing added sum reaches {0.5 * was:.4g} noise floors, not {was:.4g}, from the best parameters of "
+            f"the search"
+        )
+        assert d.notes == ([says] if better else []) and d.verdict == "missing"
+
+
+def test_the_last_word_is_asked_where_nobody_can_come_closer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What effects make of what happens between two rows lifts the floor; it is then known to five per cent."""
+    x = signals(33)
+    stage = linear(x, with_noise(33, x, 1.1, 2.0))
+    stage.hidden = lambda theta: np.array([0.5])
+    known: list[float] = []
+    monkeypatch.setattr(
+        diagnosis, "searched",
+        lambda criterion, judged, tick: known.append((criterion.known, float(criterion.judge.floor[0]))) or criterion,
+    )  # fmt: skip
+    monkeypatch.setattr(
+        diagnosis, "_search",
+        lambda criterion: (
+            Search(criterion), criterion.judge.fit(("a",), stage.neutral()), [], [("nominal", 1.0)],
+        ),
+    )  # fmt: skip
+    d = diagnosis._to_the_floor(stage, FLOOR[:1], None, None, LikelihoodAcceptance)
+    lifted = float(np.hypot(0.1, 0.5))
+    assert known == [(FLOOR_KNOWN, 0.1), (pytest.approx(TOLERATED - 1.0), pytest.approx(lifted))]  # type: ignore[comparison-overlap]
+    assert d.floor[0] == pytest.approx(lifted)
+
+
+@pytest.mark.parametrize(
+    ("coarse", "effects", "nearest", "kept"),
+    [({}, True, [], True), ({"y": "y lacks bits"}, False, ["n"], False), ({"u": "u lacks bits"}, True, [], False),
+     ({"u": "u lacks bits"}, False, ["n"], True)],
+)  # fmt: skip
+def test_no_answer_rests_on_a_channel_that_lacks_bits(
+    coarse: dict[str, str], effects: bool, nearest: list[str], kept: bool
+) -> None:
+    x = signals(34)
+    stage = linear(x, with_noise(34, x, 1.1, 2.0))
+    stage.coarse = coarse
+    judge = problem(stage)
+    fit = judge.fit(("a",), stage.neutral())
+    said = answer_of(judge, "missing", fit, fit, found_of(judge, fit, ("a",), {"a": fit}) if effects else [], [])
+    said.nearest = nearest
+    d = diagnosis._unless_coarse(stage, said)
+    assert (d is said) == kept
+    if not kept:
+        assert d.verdict == "unknown" and d.effects == [] and d.refused == list(coarse.values())
+        assert d.nearest == (["a"] if effects else ["n"])
+
+
+@pytest.mark.parametrize("criterion", [LikelihoodAcceptance, RelativeErrorAcceptance])
+def test_candidates_are_ranked_by_what_they_gain_alone_and_say_what_a_log_lacks(criterion: Any) -> None:
+    x = signals(35)
+    x[3] = 1e-9 * x[3]
+    library = (effect("a"), effect("b"), effect("c", excites="a turn of c"))
+    stage = linear(x, with_noise(35, x, 1.1, 2.0, 0.3), effects=library)
+    judge = problem(stage)
+    search, fit, candidates, steps = diagnosis._search(Search(criterion(judge)))
+    assert [c.effect for c in candidates][:2] == ["a", "b"] and sorted(fit.effects) == ["a", "b"]
+    for c in candidates[:2]:
+        alone = search.fits[frozenset((c.effect,))]
+        assert (c.nats, c.spreads) == pytest.approx(search.criterion.gain(search.base, alone))
+        assert c.left == rms_of(judge, alone) and c.reason == ""
+    assert candidates[2].reason == ("a turn of c" if criterion is LikelihoodAcceptance else "")
+    assert steps[0] == ("nominal", rms_of(judge, search.base)) and steps[-1][1] == rms_of(judge, fit)
+    bare = linear(x[[0, 3]], with_noise(35, x, 1.1), effects=(effect("c"),))
+    quiet, fit, (c,), steps = diagnosis._search(Search(criterion(problem(bare))))
+    assert fit is quiet.base and len(steps) == 1
+    if criterion is LikelihoodAcceptance:
+        assert c.reason == "this log does not excite it" and quiet.quiet
