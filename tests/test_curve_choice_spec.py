@@ -155,6 +155,10 @@ def test_a_curve_is_judged_on_blocks_that_it_was_not_fitted_to(seed: int) -> Non
         others = np.linalg.lstsq(a, np.concatenate([rest[use], np.zeros(len(whole) - 1)]), rcond=None)[0]
         held = np.sum((rest[~use] - rows[~use][:, 1:] @ others) ** 2)
         assert fit.held_out[b] == pytest.approx(max(held, 0.5 * fit.cost[b]), rel=1e-3)
+    stiff = fitted(c, measured(seed), tolerance=0.01)  # a prior pulls at its parameter whatever is left out
+    some = np.arange(judge.n_blocks) < 4
+    rest = stiff.fit.theta + step_without(stiff, some) * stiff.judge.scale[stiff.fit.free]
+    assert abs(rest[0] - 1.0) < 0.0100001
     held_blocks = np.arange(judge.n_blocks) < 4
     step = step_without(t, held_blocks) * scale[fit.free]
     use = ~np.isin(block, np.flatnonzero(held_blocks))
@@ -328,6 +332,7 @@ def test_one_amplitude_confirms_no_memory_and_what_remembers_nothing_needs_no_ot
         )
     after, before = remembering([wave(1.0)], np.full(6, 1.0), np.full(6, 100.0))
     assert not confirmation.another_confirms(learner, before, after)
+    assert confirmation._confirmation(learner, before, after).limit == pytest.approx(1.0 - LEAST_FALL)
     assert confirmation.another_confirms(learner, before, tried("u"))
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from tests.test_curve_choice_spec import chooser, ordering, tried
 from vaneloop import Record, System, unknown
+from vaneloop.base.forms import FORMS
 from vaneloop.identification.candidates.closed_forms import Formula
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.subsystem import Array
@@ -23,9 +24,10 @@ from vaneloop.identification.unmodelled import (
     learning,
     parametric_substitution,
     regressors,
+    screening,
     surface_search,
 )
-from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas, likely
+from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas, goes_on, likely
 from vaneloop.identification.unmodelled.curve_candidates import Candidate, UserModelCandidates, with_curves
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
 from vaneloop.identification.unmodelled.learned_law import law_of
@@ -63,14 +65,21 @@ def gain(u: Any, p: Any) -> Any:
     return p.a * u.u
 
 
-def ground_of(law: Any, places: list[str], test: Any = None, noise: float = 0.01) -> UserModelCandidates:
-    """y = 2 u and a law of u and w, on a log and perhaps a test log that goes further."""
+def ground_of(
+    law: Any,
+    places: list[str],
+    test: Any = None,
+    noise: float = 0.01,
+    first: tuple[Array, Array] = (U, W),
+    t: Array = T,
+) -> UserModelCandidates:
+    """y = 2 u and a law of u and w, on a ``first`` log and perhaps a ``test`` log that goes further."""
     s = System("map", "static", gain, inputs={"u": "V", "w": "A"}, outputs={"y": "V"},
                parameters=[unknown("a", 2.0, "-")], **({"places": places} if places else {}))  # fmt: skip
     records = []
-    for k, (x, z) in enumerate(((U, W), *([test] if test is not None else []))):
+    for k, (x, z) in enumerate((first, *([test] if test is not None else []))):
         y = 2.0 * x + law(x, z) + noise * white(k, len(x))
-        records.append(Record("log" if k == 0 else "test", T, {"u": x, "w": z, "y": y}))
+        records.append(Record("log" if k == 0 else "test", t, {"u": x, "w": z, "y": y}))
     return UserModelCandidates(bind(s, records[:1], records[1:]))
 
 
@@ -596,3 +605,128 @@ def test_a_formula_that_was_learned_with_another_one_is_told_beside_it(monkeypat
     made.clear()
     parametric_substitution.tell_each_by_its_formula(learner, tried("stops_of_u"), second)
     assert made == []
+
+
+# ---- what repeats itself, and the steps of the search by themselves --------------------------------------------------
+
+
+@pytest.mark.parametrize("how", ["output adds", "output times"])
+def test_what_repeats_itself_in_time_is_a_candidate_with_its_period(how: str) -> None:
+    period, t = 1.7, 0.1 * np.arange(600)
+    # what drives it has no line of its own
+    x, z = (np.interp(t, np.arange(0.0, 61.0, 0.7), 1.5 * white(k, 88)) for k in (7, 8))
+
+    def law(u: Array, w: Array) -> Array:
+        wave = 0.3 * np.sin(2.0 * np.pi * t / period)
+        return wave if how == "output adds" else 2.0 * u * wave
+
+    learner, nothing = learner_on(ground_of(law, ["y"], first=(x, 3.0 + z), t=t))
+    found = [
+        c for c in screening._periodic(learner, nothing) if c.how == how and c.quantity.name.startswith("time_every")
+    ]
+    assert found and min(abs(c.quantity.period - period) for c in found) < 0.03
+    learner.candidates = [replace(c, shape=("odd",)) for c in learner.candidates]
+    assert screening._periodic(learner, nothing) == []  # a known shape is no wave
+
+
+def test_what_repeats_itself_along_a_channel_is_one_where_the_model_tells_it() -> None:
+    learner, nothing = learner_on(ground_of(lambda u, w: 0.2 * np.sin(2.0 * np.pi * u / 0.31), ["y"]))
+    learner.candidates = [c for c in learner.candidates if c.quantity.name in ("u", "time") and c.how == "output adds"]
+    courses = learner.ground.courses((), nothing.fit.theta)
+    along = screening._along(learner, courses)
+    assert all(c.quantity.name.startswith("u_every") for c in along)
+    assert screening._along(learner, [c._replace(said=np.zeros((0, len(c.t)))) for c in courses]) == []
+
+
+def test_how_far_a_search_for_curves_is_rises_to_its_end() -> None:
+    learner, nothing, _ = cubed()
+    keep, told = learner.candidates, []
+    learner.candidates = [c for c in keep if c.quantity.name in ("w", "u", "time") and c.how == "output adds"]
+    learner.progress = told.append
+    try:
+        learner.finalists(nothing)
+    finally:
+        learner.candidates, learner.progress = keep, lambda _: None
+    assert len(told) >= 4 and told == sorted(told) and 0.0 < told[0] < 0.05 and 0.75 < told[-1] < 1.0
+
+
+def test_curves_are_accepted_by_the_rules_or_by_a_formula(monkeypatch: pytest.MonkeyPatch) -> None:
+    good, poor, said = tried("u", 1.0), tried("w", 9.0), tried("v", 8.0)
+    asked: list[Any] = []
+
+    def earning(learner: Any, before: Any, poor_ones: Any, among: Any) -> list[Any]:
+        asked.append((list(poor_ones), list(among)))
+        return [said]
+
+    monkeypatch.setattr(learning, "earning_by_formula", earning)
+    learner = chooser()
+    learner.allowed = lambda before, t: t is good  # type: ignore[method-assign]
+    three = [good, poor, said]
+    assert learner.accepted(tried("none", 9.0), three) == [good, said]
+    assert asked == [([poor, said], three)] and learner.by_formula == {"y.curve_of_v"}
+    assert learner.out.nearest == [t.candidate.name for t in three]
+    learner.speaks = False
+    assert learner.accepted(tried("none", 9.0), three[:1]) == [good] and learner.by_formula == frozenset()
+    assert learner.out.nearest == [t.candidate.name for t in three]  # of the first step
+
+
+def test_a_hysteresis_must_dissipate(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = chooser()
+    learner.accepts = lambda before, t: True  # type: ignore[method-assign]
+    slips, plain = tried("stops_of_u"), tried("u")
+    monkeypatch.setattr(FittedCandidate, "table", lambda self: (lambda a: a, np.zeros(3)))
+    for share, allowed in ((0.19, True), (0.21, False)):
+        monkeypatch.setattr(learning, "share_given_back", lambda low, high, y, share=share: share)
+        assert learner.allowed(tried("none"), slips) == allowed and learner.allowed(tried("none"), plain)
+
+
+def test_two_curves_are_told_each_by_its_formulas(monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing, one, two = tried("none"), tried("u"), tried("w")
+    told: list[Any] = []
+    monkeypatch.setattr(learning, "tell_each_by_its_formula", lambda learner, *curves: told.append(curves))
+    learner = chooser()
+    learner._without_first = lambda first, second: [first, second]  # type: ignore[method-assign]
+    assert learner.pruned([nothing, one, two]) == [nothing, one, two] and told == [(one, two)]
+    learner._without_first = lambda first, second: [second]  # type: ignore[method-assign]
+    assert learner.pruned([nothing, one, two]) == [nothing, two] and len(told) == 1
+    assert learner.pruned([nothing, one]) == [nothing, one] and learner.pruned([nothing]) == [nothing]
+
+
+def test_a_formula_in_place_of_a_gain_has_no_mean() -> None:
+    learner, nothing = learner_on(ground_of(lambda u, w: 0.3 * u * (w - 2.0), []))
+    t = curve(learner, nothing, place(learner, "w", "parameter times"))
+    for formula, alone in fitted_formulas(learner.ground, t):
+        placed = alone.curves[-1][0].curve
+        assert placed is not None
+        numbers = alone.fit.theta[1:]
+        assert np.mean(placed.at(W, placed.row(numbers))) == pytest.approx(0.0, abs=3e-3), formula.form
+        assert rms_of(alone.judge, alone.fit) == formula.error
+
+
+def test_what_steepens_to_one_side_ends_there() -> None:
+    c = replace(
+        named(cubed()[0], place(cubed()[0], "u")), quantity=Quantity("u", "V", INPUT, np.linspace(-1.0, 1.0, 400))
+    )
+    basis = curve_candidates.basis_for(c.quantity)
+    assert basis is not None
+    c = replace(c, basis=basis)
+    form = next(f for f in FORMS if f.name == "exponential")
+    ground: Any = SimpleNamespace(reach=lambda c: (-3.0, 3.0))
+    low, high = goes_on(ground, c, form, np.array([1.0, -2.0]))
+    assert high == 3.0 and low == pytest.approx(-1.0 - 0.5 * np.log(10.0), abs=0.03)
+
+
+def test_stops_have_radii_up_to_half_of_the_way_and_repeat_themselves_by_their_own_numbers() -> None:
+    course = (2.0 * U,)
+    stops = Quantity("stops_of_u", "V", COLUMN, np.abs(U), course)
+    basis = curve_candidates.basis_for(stops)
+    assert (
+        basis is not None
+        and basis.high == pytest.approx(0.5 * np.ptp(course[0]), rel=0.02)
+        and basis.low == pytest.approx(0.0, abs=0.05)
+    )
+    c = named(cubed()[0], place(cubed()[0], "u"))
+    again = c.every(0.7)
+    for of, period in ((INPUT, again.quantity.period), (COLUMN, 0.0)):
+        placed = replace(again, quantity=replace(again.quantity, of=of)).placed().curve
+        assert placed is not None and placed.period == period and again.quantity.period > 0.0
