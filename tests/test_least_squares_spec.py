@@ -673,3 +673,49 @@ def test_so_many_slopes_are_kept() -> None:
     assert all(kept.of(p, free).fits(half) for p in places[:2])
     kept.put(places[2], free, error, np.zeros((1, 1, 1)))
     assert [kept.of(p, free).fits(n) for p, n in zip(places, (half, half, 1), strict=True)] == [False, True, True]
+
+
+def test_a_rough_fit_of_a_poor_model_ends_where_it_gains_less_than_can_be_told() -> None:
+    many, totals = [], []
+    for roughly in (False, True):
+        asked: list[int] = []
+        stage = decaying(4, 6.0, 1.2, asked)
+        stage.measured = stage.measured + 1.2 * np.sin(9.0 * DECAY)  # far more than noise, and no parameter's
+        judge = LeastSquaresProblem(stage, FLOOR[:1])
+        judge.roughly = roughly
+        asked.clear()
+        fit = judge.fit(("law",), np.array([1.0, 1.0, 0.4]), 30)
+        many.append(len(asked))
+        totals.append(judge.total_of(fit))
+    told = 0.2 * 3 * (1.0 + (totals[0] - N) / EVIDENCE)
+    assert totals[0] > 20.0 * N and totals[0] <= totals[1] + 1e-6 <= totals[0] + 4.0 * told and many[1] < many[0]
+
+
+def test_a_model_without_a_parameter_that_may_move_is_simulated_once() -> None:
+    asked: list[int] = []
+    stage = decaying(5, 2.0, 1.0, asked)
+    stage.parameters = (Parameter("gain", 1.0, "1"),)
+    judge = LeastSquaresProblem(stage, FLOOR[:1])
+    asked.clear()
+    fit = judge.fit((), np.array([1.0, 0.0, 0.0]))
+    assert asked == [1] and len(fit.free) == 0 and np.array_equal(fit.held_out, fit.cost)
+    assert fit.cost.sum() == pytest.approx(np.sum((stage.measured - 1.0) ** 2) / FLOOR[0] ** 2)
+    assert judge.correlation(fit).shape == (0, 0) and judge.total_of(fit) == fit.cost.sum()
+
+
+@given(seed=st.integers(0, 99), k=st.integers(1, 5))
+@settings_of(max_examples=examples(15), deadline=None)
+def test_a_bounded_step_is_never_worse_than_none_and_stays_within(seed: int, k: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows = rng.standard_normal((k + 3, k))
+    a, g = rows.T @ rows + 1e-9 * np.eye(k), rows.T @ rng.standard_normal(k + 3)
+    low, high = -rng.random(k), rng.random(k)
+    step = bounded_step(a, g, low, high)
+    assert np.all(step >= low) and np.all(step <= high)
+    assert step @ a @ step - 2.0 * g @ step <= 1e-9
+    free = (step > low) & (step < high)
+    if free.any():  # what is free has come to rest beside what has stopped
+        assert (g - a @ step)[free] == pytest.approx(np.zeros(int(free.sum())), abs=1e-7)
+    far = np.linalg.solve(a, g)
+    wide = bounded_step(a, g, far - 1.0, far + 1.0)
+    assert wide == pytest.approx(far)
