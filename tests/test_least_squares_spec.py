@@ -719,3 +719,47 @@ def test_a_bounded_step_is_never_worse_than_none_and_stays_within(seed: int, k: 
     far = np.linalg.solve(a, g)
     wide = bounded_step(a, g, far - 1.0, far + 1.0)
     assert wide == pytest.approx(far)
+
+
+@pytest.mark.parametrize("window", [None, 10.0])
+def test_a_raster_makes_expect_as_much_in_each_block_as_its_draws_have(window: float | None) -> None:
+    stage, _ = made(6, window=window)
+    assert LeastSquaresProblem(stage, FLOOR).expected().tolist() == [1.0] * LeastSquaresProblem(stage, FLOOR).n_blocks
+    rng = np.random.default_rng(6)
+    stage.lost = rng.standard_normal((4, 2, N)) * np.where(np.arange(N) < 30, 0.8, 0.05)
+    stage.measured[1, 100:140] = np.nan
+    judge = LeastSquaresProblem(stage, FLOOR)
+    counted = np.isfinite(stage.measured)
+    squares = np.zeros((2, N))
+    for draw in stage.lost:
+        e = np.where(counted, draw / FLOOR[:, None], 0.0)
+        if window:
+            starts = judge.window_start
+            assert starts is not None
+            for first, end in zip(starts, [*starts[1:], N], strict=True):
+                for o in range(2):
+                    here = counted[o, first:end]
+                    e[o, first:end][here] -= e[o, first:end][here].mean() if here.any() else 0.0
+        squares += e * e / len(stage.lost)
+    beyond = 1.0 + squares - (squares.sum(axis=1) / counted.sum(axis=1))[:, None]
+    assert judge.lost() == pytest.approx(beyond)
+    block = np.repeat(np.arange(judge.n_blocks), np.diff(np.append(judge.block_start, N)))
+    wanted = [np.sum(beyond[:, block == b][counted[:, block == b]]) / judge.samples[b] for b in range(judge.n_blocks)]
+    assert judge.expected() == pytest.approx(np.maximum(wanted, 0.1)) and min(wanted) < 0.1 < max(wanted)
+
+
+@pytest.mark.parametrize("period", [0.8, 6.0])
+def test_a_fit_leaves_a_direction_within_its_turn(period: float) -> None:
+    turn = Parameter("way", 0.0, "rad", -0.3, period - 0.3, period=period, scale=0.1 * period)
+    stage = decaying(7, 1.0, 1.0)
+    wave = lambda way: np.cos(2.0 * np.pi * (DECAY[None] - way[:, None]) / period)  # noqa: E731
+    stage.parameters, stage.effects = (), (Effect("e", (turn,), ((0.0,),)),)
+    stage.run = lambda thetas: wave(thetas[:, 0])[:, None, :]
+    stage.measured = wave(np.array([0.4 * period]))[None, 0] + FLOOR[0] * np.random.default_rng(7).standard_normal(
+        (1, N)
+    )
+    judge = LeastSquaresProblem(stage, FLOOR[:1])
+    fit = judge.fit(("e",), np.array([0.2 * period + 3.0 * period]))
+    assert fit.theta[0] == pytest.approx(0.4 * period, abs=0.02 * period)
+    assert judge.wrapped(np.array([0.4 * period - 2.0 * period])) == pytest.approx([0.4 * period])
+    assert fit.high[0] - fit.low[0] <= period and judge.bounds()[0][0] == -np.inf and judge.bounds()[1][0] == np.inf
