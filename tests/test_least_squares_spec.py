@@ -763,3 +763,42 @@ def test_a_fit_leaves_a_direction_within_its_turn(period: float) -> None:
     assert fit.theta[0] == pytest.approx(0.4 * period, abs=0.02 * period)
     assert judge.wrapped(np.array([0.4 * period - 2.0 * period])) == pytest.approx([0.4 * period])
     assert fit.high[0] - fit.low[0] <= period and judge.bounds()[0][0] == -np.inf and judge.bounds()[1][0] == np.inf
+
+
+@pytest.mark.parametrize("tolerance", [0.2, 3.0])
+def test_a_parameter_that_the_log_does_not_tell_is_as_uncertain_as_its_tolerance(tolerance: float) -> None:
+    stage, x = made(8, tolerance, sizes=(1.0, 0.0, 0.0))
+    x[0] *= 1e-6
+    stage.measured = FLOOR[:, None] * np.random.default_rng(8).standard_normal((2, N))
+    judge = LeastSquaresProblem(stage, FLOOR)
+    fit = judge.fit((), stage.neutral())
+    assert fit.theta[0] == pytest.approx(1.0, abs=0.01 * tolerance)
+    half = NINETY * tolerance / np.sqrt(3.0)  # of a uniform interval
+    assert (fit.high - fit.low) / 2.0 == pytest.approx([half], rel=1e-3)
+
+
+@pytest.mark.parametrize(("most", "batches"), [(1, [2, 3, 2]), (4, [2, 3, 2]), (5, [5, 2]), (6, [5, 2]), (7, [7])])
+def test_tasks_are_simulated_side_by_side_up_to_so_many_values(
+    most: int, batches: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage, _ = made(9)
+    judge = LeastSquaresProblem(stage, FLOOR)
+    monkeypatch.setattr("vaneloop.identification.least_squares.problem.MAX_VALUES", most * stage.measured.size)
+    asked: list[int] = []
+    errors = judge.errors
+
+    def noted(thetas: Array) -> Array:
+        asked.append(len(thetas))
+        return errors(thetas)
+
+    monkeypatch.setattr(judge, "errors", noted)
+    sets = [np.random.default_rng(k).standard_normal((many, 3)) for k, many in enumerate((2, 3, 2))]
+
+    def task(thetas: Array) -> Any:
+        return (yield thetas)
+
+    answers = judge.together([task(thetas) for thetas in sets])
+    assert asked == batches
+    for thetas, answer in zip(sets, answers, strict=True):
+        assert answer == pytest.approx((stage.measured - stage.run(thetas)) / FLOOR[:, None])
+    assert judge.together([]) == []
