@@ -24,7 +24,7 @@ from vaneloop.identification.results import StageDiagnosis, answer_of, found_of,
 from vaneloop.identification.selection import diagnosis
 from vaneloop.identification.selection.diagnosis import EffectSelection, extend_stage, floor_of
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, _above_floor, as_close
-from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance
+from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance, structure
 from vaneloop.identification.selection.rules import BEGINS, Comparison
 from vaneloop.identification.selection.screening import Linearisation, _best_within, _solved, followed
 from vaneloop.identification.selection.search import Search
@@ -930,3 +930,21 @@ def test_candidates_are_ranked_by_what_they_gain_alone_and_say_what_a_log_lacks(
     assert fit is quiet.base and len(steps) == 1
     if criterion is LikelihoodAcceptance:
         assert c.reason == "this log does not excite it" and quiet.quiet
+
+
+@pytest.mark.parametrize("share", [0.0, 0.6])
+def test_what_channels_predict_of_an_error_is_no_matter_of_its_size(share: float) -> None:
+    x = signals(40, 1, n=800)
+    channel = np.sin(0.31 * np.arange(800)) + 0.4 * np.sin(1.7 * np.arange(800))
+    noise = np.random.default_rng(40).standard_normal(800)
+    e = np.sqrt(share) * channel / channel.std() + np.sqrt(1.0 - share) * noise
+    found = []
+    for size in (1.0, 1e-3):
+        stage = linear(0.0 * x, size * FLOOR[0] * e[None], "a")
+        stage.regimes = {"time": stage.t, "u": channel, "y": e}
+        judge = problem(stage)
+        fit = judge.fit((), stage.neutral())
+        found.append(structure(judge, fit))
+        stage.regimes = {"time": stage.t, "y": e}  # neither time nor what is measured itself
+        assert structure(judge, fit) == 0.0
+    assert found[0] == pytest.approx(found[1], rel=1e-6, abs=1e-12) and found[0] == pytest.approx(share, abs=0.15)
