@@ -173,9 +173,10 @@ def test_sets_are_moved_to_where_the_model_has_followed(many: int) -> None:
     judge = problem(stage)
     base = judge.fit((), stage.neutral())
     thetas = [base.theta + np.array([0.0, 0.02 * k, 0.0, 0.0]) for k in range(many)]
-    given_there = [theta.copy() for theta in thetas]
+    given_there, given_arrays = [theta.copy() for theta in thetas], list(thetas)
     errors, lefts = followed(judge, thetas, base.free, base.prior)
     assert errors == pytest.approx(judge.errors(np.array(given_there)), abs=1e-9)
+    assert all(np.array_equal(was, now) for was, now in zip(given_there, given_arrays, strict=True))
     for theta, before, left in zip(thetas, given_there, lefts, strict=True):
         assert theta[1:].tolist() == before[1:].tolist()
         rest = (stage.measured - before[1] * x[1]).ravel() / FLOOR[0]
@@ -231,7 +232,10 @@ def test_where_one_effect_leads_to_another_is_tried_once() -> None:
     stage = replace(linear(x, np.zeros((1, N)), effects=(plain, whole)), run=run)
     stage.measured = run(np.array([[1.1, 0.0, 3.0, 0.35]]))[0] + FLOOR[0] * signals(7, 0)[0]
     search = search_of(stage)
+    assert search._held(("whole",)) == []
     search.single("plain")
+    assert [(name, held) for name, held, _ in search._held(("whole",))] == [("whole", "plain")]
+    assert search._held(("whole", "plain")) == []  # both are there
     bad = replace(search.base, effects=("whole",), free=np.array([0, 2, 3]))
     (led,) = search.judge.together([search._led_on(bad)])
     assert led.theta[2:] == pytest.approx([3.0, 0.35], abs=0.1)
@@ -252,6 +256,9 @@ def test_a_pair_is_begun_from_its_effects_where_none_of_them_was_fitted() -> Non
         fit = search.joined(names)
         best = least(x, measured, [0, *(1 + "abc".index(n) for n in names)])
         assert search.judge.total_of(fit) == pytest.approx(2.0 * best.cost, rel=1e-6) and fit.effects == names
+        assert frozenset(names) in search.finished and search.joined(names) is search.fits[frozenset(names)]
+    (rough,) = search.judge.together([search._joined(("a", "c"), False)])
+    assert rough.effects == ("a", "c") and frozenset("ac") not in search.finished  # enough to rank it
     assert search.joined(()) is search.base
 
 
@@ -355,6 +362,13 @@ def test_a_model_fails_above_its_floor_over_the_log_or_in_a_block(side: float, e
     judge.n = 0
     samples[:] = 0
     assert not fails(quiet)
+
+
+def test_where_nobody_knows_the_noise_a_model_fails_a_tenth_above_it() -> None:
+    judge: Any = SimpleNamespace(n=100)
+    for error, fails in ((1.09, False), (1.11, True)):
+        fit: Any = SimpleNamespace(held_out=np.full(4, 25.0 * error**2))
+        assert RelativeErrorAcceptance(judge).fails(fit) == fails
 
 
 @pytest.mark.parametrize(("excess", "limit"), [(1.0, TOLERATED), (2.0, 2.0 * (1.0 + FLOOR_KNOWN))])
@@ -465,7 +479,7 @@ def test_a_direction_is_tried_all_round_with_the_middle_size() -> None:
     size = Parameter("size", 0.0, "1", 0.0, 9.0)
     round_it = Effect("e", (size, turn), ((0.1, 0.0), (1.0, 0.0), (5.0, 0.0)))
     tried = _tried(round_it)
-    assert [s[0] for s in tried] == [1.0] * DIRECTIONS
+    assert [s[0] for s in tried] == [1.0] * DIRECTIONS and {len(s) for s in tried} == {2}
     assert [s[1] for s in tried] == pytest.approx([-1.0 + 0.5 * k for k in range(DIRECTIONS)])
     assert _tried(effect("a")) == [(-1.0,), (1.0,)]
 
@@ -657,6 +671,7 @@ def test_how_much_errors_are_alike_is_learnt_from_the_best_fit() -> None:
     stage = linear(signals(24), signals(24)[0] + FLOOR[0] * e[None])
     judge = problem(stage)
     criterion = LikelihoodAcceptance(judge)
+    assert (criterion.correlation, criterion.known, criterion.left_out) == (1.0, FLOOR_KNOWN, {})
     fit = judge.fit((), stage.neutral())
     criterion.learn(fit)
     assert criterion.correlation == correlation_of(judge, fit) > 2.0
@@ -734,6 +749,10 @@ def test_a_pair_of_an_excerpt_follows_to_the_whole_log_and_is_no_worse_than_its_
     search.ahead.tick = lambda: ticks.append(1)
     search.ahead.judge.together([search.ahead._quick("a")])
     assert len(ticks) == 1
+    search.ahead.judge.together([search.ahead._joined(("b",), False)])
+    assert frozenset("b") in search.ahead.fits and frozenset("b") not in search.ahead.finished  # quick ones alone
+    search.ahead.judge.together([search.ahead._joined(("b",), True)])
+    assert frozenset("b") in search.ahead.finished
     rough = search._rough(search.ahead.joined(("a", "c")))
     assert judge.block_costs(judge.errors(rough.theta[None]))[0] == pytest.approx(rough.cost, rel=1e-9)
     alone = search.single("a")
