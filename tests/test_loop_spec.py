@@ -83,6 +83,9 @@ def test_a_log_gives_its_demand_and_its_speed_where_it_has_one() -> None:
     np.testing.assert_allclose(d.t, [0.0, 0.01, 0.02, 0.03], atol=1e-12)  # from where both have begun
     assert d.n_dem.tolist() == [60.0, 61.0, 61.0, 62.0]
     assert d.n_r is not None and d.n_r.tolist() == [50.0, 50.0, 51.0, 51.0]
+    d = demand_of_log(Log("run.csv", {"n_dem": dem, "n_r": Channel(np.array([5.03]), np.array([50.0]))}))
+    np.testing.assert_allclose(d.t, [0.0, 0.02, 0.04], atol=1e-12)  # one reading holds throughout
+    assert d.n_r is not None and d.n_r.tolist() == [50.0] * 3
 
 
 def profile(folder: Path, text: str) -> Demand:

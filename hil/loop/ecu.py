@@ -137,10 +137,11 @@ def demand_of_log(log: Any) -> Demand:
         t = t[t >= max(c.t[0], r.t[0])] if len(r.t) > 1 else c.t
         n_r = r.values[held(r, t)]
     n_dem = c.values[held(c, t)]
-    return _checked(Demand(t - t[0], n_dem, n_r, held=True), log.path)
+    return _checked(Demand(t, n_dem, n_r, held=True), log.path)
 
 
 def _checked(demand: Demand, source: Any) -> Demand:
+    """The demand from time 0 on."""
     t, n = demand.t, demand.n_dem
     if not np.isfinite(t).all() or not np.isfinite(n).all():
         raise InputError(f"{source}: t and n_dem must be finite")
