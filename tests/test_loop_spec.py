@@ -24,6 +24,7 @@ from hil.loop import engines, lanes, lockstep, realtime, tick
 from hil.loop.ecu import BUILTIN, Demand, EcuStation, Typed, builtin, demand_of_log, read_profile
 from hil.loop.heard_lanes import noise_of
 from hil.loop.lockstep import Run, Stimulus, columns_of, snapshot_names, to_border
+from hil.loop.node import Ecu
 from hil.loop.realtime import Lateness, Report, Stop, Ticker, packed, run_realtime, stop_on_signals
 from hil.loop.secured import run_secured
 from hil.loop.tick import KEPT, new_loop
@@ -1031,3 +1032,49 @@ def test_a_secured_run_gives_what_was_taken_and_sent_tick_by_tick() -> None:
     assert got.taken_at[0] == 0 and got.taken[0].tolist() == [frames.FRESHNESS, 99]
     assert got.taken_at[1:].tolist() == list(range(1, 30, 3)) and got.taken[1:, 0].tolist() == [heads[0]] * 10
     assert ecu.heard[0] == 1 and vgv.heard[:3] == [1, 1, 0] and got.run.error_frames == 0
+
+
+def test_an_ecu_begins_at_its_demand_and_hears_so_many_frames_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = EcuStation(Demand(np.array([0.0, 1.0]), np.array([61.0, 75.0])))
+    again = EcuStation(Demand(np.array([0.0, 1.0]), np.array([61.0, 90.0])), ecu=Ecu(n_dem=61.0))
+    states = [np.concatenate([np.ravel(a) for a in e.arrays]) for e in (first.ecu, again.ecu, Ecu(n_dem=75.0))]
+    assert np.array_equal(*states[:2], equal_nan=True) and not np.array_equal(*states[::2], equal_nan=True)
+    rooms: list[int] = []
+
+    class Empty:
+        def read(self, rows: np.ndarray) -> int:
+            rooms.append(len(rows))
+            return 0
+
+        def write(self, rows: np.ndarray) -> None:
+            pass
+
+    clock = Still(monkeypatch)
+    ticker = Ticker()
+    assert (ticker.start, ticker.deadline) == (0, 0)
+    clock.take(ticker)
+    wide: list[int] = []
+
+    class Wide:
+        k = 0
+
+        def tick(self, received: np.ndarray, n: int) -> np.ndarray:
+            wide.append(len(received))
+            return received[:0]
+
+    run_realtime(Wide(), Empty(), ticks=2, ticker=ticker)  # type: ignore[arg-type]
+    assert set(rooms) == {64} and set(wide) == {64 + 4}  # and the notes of the loop and of the node
+
+
+def test_a_wall_clock_is_that_of_the_beginning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(realtime.time, "time_ns", lambda: 1_700_000_000_000 * MS)
+    now = iter([500 * MS, 512 * MS])
+    monkeypatch.setattr(realtime.time, "monotonic_ns", lambda: next(now))
+    assert realtime.wall_clock()() == 1_700_000_000_012
+
+
+def test_a_run_tells_how_long_it_took(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([1000.0, 1002.5])
+    monkeypatch.setattr(lockstep.time, "perf_counter", lambda: next(clock))
+    assert lockstep.lockstep(Stimulus.of(np.full(2, 60.0)), hashed=False).wall_s == 2.5
+    assert engines.Engines(*[np.zeros(0)] * 10, [], 1.0).wall_s == 0.0
