@@ -152,7 +152,9 @@ def _noise_in(judge: LeastSquaresProblem, k: int, error: Array, made: Array, out
     excess = 1.0 - floor**2 / whole
     if whole <= ((1.0 + FLOOR_KNOWN) * floor) ** 2:
         return Expected(floor, 0.0)
-    ratio, deviation = _over_blocks(square, own * n + share * through)
+    expected = own * n + share * through
+    of = np.maximum(expected, whole * n)  # where little is expected, what is left counts as it does elsewhere
+    ratio, deviation = _over_blocks(square - expected + of, of)
     mean, of_mean = _over_blocks(sign, n)
     of_sign = NOISE_ALIKE * excess * whole * float(np.mean(place[judge.valid[k]] ** 2))
     differs = np.abs(ratio - 1.0) > NOISE_ALIKE * excess + 2.0 * deviation
