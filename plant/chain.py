@@ -17,7 +17,7 @@ import math
 
 import numpy as np
 
-from plant import curve, drive, electromechanical, engine, lvdt, stem
+from plant import curve, drive, electromechanical, engine, lvdt, stem, unison
 from plant.actuator import speed_factor, stroke_step
 from plant.effect import T_REF
 from plant.effects import CURVES, N_STATE, STATE, aero_load
@@ -42,6 +42,7 @@ from plant.linkage import (
     vane_per_ring,
 )
 from plant.parameters import (
+    ACTUATORS,
     DRIVE_EFFECTS,
     DRIVE_LOADED,
     FLOW_GAIN,
@@ -146,6 +147,9 @@ def drive_step(
         if p[KIND, j] != 0.0:
             _motor_step(s, p, j, i_cmd, n_r, t_oil, dt, substeps)
             return
+        if p[ACTUATORS, j] != 0.0:
+            _joined_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps)
+            return
         _drive_step(s, p, j, i_cmd, n_r, p_s, t_oil, dt, substeps)
         return
     target = i_cmd / p[RATED_CURRENT, j]
@@ -208,6 +212,32 @@ def _motor_step(
 
 
 @in_place
+def _joined_step(
+    s: np.ndarray, p: np.ndarray, j: int, i_cmd: float, n_r: float, p_s: float, t_oil: float, dt: float, substeps: int
+) -> None:
+    """`drive_step` of two actuators, A in lane ``j`` and B in the next, on the same rings (`plant.unison`). Both valves
+    get the current; each piston has half of the air's load.
+    """
+    d_a, d_b, z_a, z_b = drive.prepare(p, j), drive.prepare(p, j + 1), drive.taken(s, j), drive.taken(s, j + 1)
+    y_a, i_a = drive.current(drive.remembered(s, j), d_a, i_cmd, True)
+    y_b, i_b = drive.current(drive.remembered(s, j + 1), d_b, i_cmd, True)
+    load = 0.5 * drive.load_of(d_a, n_r)
+    feed_a = drive.feed(d_a, drive.flow_gain(d_a, t_oil), load, p_s)
+    feed_b = drive.feed(d_b, drive.flow_gain(d_b, t_oil), load, p_s)
+    c_a, c_b = 1.0 / d_a.stiffness, 1.0 / d_b.stiffness
+    tie, h = unison.tie(s, p, j), dt / substeps
+    for _ in range(substeps):
+        w_a, w_b = unison.unjoined(z_a, d_a, load, h), unison.unjoined(z_b, d_b, load, h)
+        f_a, f_b = unison.forces(tie, w_a, w_b, c_a, c_b)
+        z_a = drive.step(z_a, d_a, drive.loaded_by(feed_a, f_a), i_a, p_s, h, True, True, True, True)
+        z_b = drive.step(z_b, d_b, drive.loaded_by(feed_b, f_b), i_b, p_s, h, True, True, True, True)
+    drive.stored(s, j, z_a)
+    drive.stored(s, j + 1, z_b)
+    drive.told(s, j, y_a)
+    drive.told(s, j + 1, y_b)
+
+
+@in_place
 def rest(s: np.ndarray, p: np.ndarray, j: int, stroke: float, n_r: float, t_oil: float) -> None:
     """Put lane ``j`` to rest at ``stroke`` (m), speed ``n_r`` (%) and ``t_oil`` (degC), every ring in the middle of its
     play. What it remembered is forgotten.
@@ -220,6 +250,12 @@ def rest(s: np.ndarray, p: np.ndarray, j: int, stroke: float, n_r: float, t_oil:
     load = aero_load.step(n_r, p[AERO_LOAD, j])
     if p[CURVES, j] != 0.0:
         load += curve.bend(s, p, j, curve.LOAD_ADDS)
+    if p[ACTUATORS, j] != 0.0:
+        for row in range(s.shape[0]):
+            s[row, j + 1] = 0.0
+        load *= 0.5
+        s[X, j + 1] = s[X_LVDT, j + 1] = s[READING, j + 1] = stroke
+        rest_actuator(s, p, j + 1, 0.0, load, t_oil)
     rest_actuator(s, p, j, 0.0, load, t_oil)
     g = GEOMETRY
     c, d = crank(driven_stroke(s, p, j), p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
@@ -342,17 +378,22 @@ def unloaded_ring_angle(p: np.ndarray, j: int, k: int, c: float, d: float, n_r: 
 def stem_angle(
     s: np.ndarray, p: np.ndarray, j: int, k: int, c: float, d: float, n_r: float, t_oil: float, t: float
 ) -> float:
-    """Turn ring ``k`` after the crank direction (c, d) at time ``t`` (s); return the angle (rad) for its potentiometer,
-    bias included.
+    """Turn ring ``k`` after the crank direction (c, d), after both cranks of two actuators, at time ``t`` (s); return
+    the angle (rad) for its potentiometer, bias included.
     """
     stage = stem.prepare(p, j, k)
     theta = ring_angle(c, d, stage.ax, stage.ay, stage.lb, stage.lc, stage.ld)
+    twist = 0.0
+    if p[ACTUATORS, j] != 0.0:
+        theta, twist = unison.ring_at(s, p, j, k)
     theta, play = stem.drive(stage, theta, n_r, t_oil, t, True), 0.0
     if p[CURVES, j] != 0.0:
         theta += curve.bend(s, p, j, curve.RING_ADDS) + curve.bend(s, p, j, curve.RING_ADDS + 1 + k)
         play = curve.bend(s, p, j, curve.PLAY_ADDS) + curve.bend(s, p, j, curve.PLAY_ADDS + 1 + k)
     z, ring = stem.follow(stem.taken(s, j, k), stage, theta, t_oil, t, stage.linkage_friction != 0.0, play)
     stem.stored(s, j, k, z)
+    if twist != 0.0:
+        ring += twist
     reading = stem.reading(stage, vane_angle(ring, stage.ldp, stage.length), t_oil, t)
     if p[CURVES, j] != 0.0:
         by, adds = curve.bend(s, p, j, curve.POT_TIMES + 1 + k), curve.bend(s, p, j, curve.POT_ADDS + 1 + k)

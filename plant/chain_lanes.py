@@ -13,7 +13,17 @@ import numpy as np
 from plant import chain, drive, engine, lanes, linkage_lanes, lvdt, stem
 from plant.effects import CURVES, EFFECTS, ROW
 from plant.linkage import G_LE, G_LX0, G_X1, G_Y1
-from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, GEOMETRY, KIND, LVDT_STEP, POT_SHARE, VANE_EFFECTS, changed
+from plant.parameters import (
+    ACTUATORS,
+    DRIVE_EFFECTS,
+    DRIVE_LOADED,
+    GEOMETRY,
+    KIND,
+    LVDT_STEP,
+    POT_SHARE,
+    VANE_EFFECTS,
+    changed,
+)
 from plant.places import N_R, POT
 from plant.sensors import quantise
 from vaneloop.base.compiled import in_place, inlined
@@ -67,7 +77,8 @@ def way(p: np.ndarray) -> tuple[int, bool] | None:
     """Return the way of a machine (its p) through a block: through the drive (0 without effects, 1 with them, 2 with a
     load too), and whether its linkage has effects. None: it goes through no block.
     """
-    if p[KIND, 0] != 0.0 or p[CURVES, 0] != 0.0 or changed(p, 0, _ON_THE_WAY) != 0.0:
+    alone = p[KIND, 0] != 0.0 or p[ACTUATORS, 0] != 0.0 or p[CURVES, 0] != 0.0
+    if alone or changed(p, 0, _ON_THE_WAY) != 0.0:
         return None
     drive_way = 0 if p[DRIVE_EFFECTS, 0] == 0.0 else 1 if p[DRIVE_LOADED, 0] == 0.0 else 2
     return drive_way, bool(p[VANE_EFFECTS, 0] != 0.0)

@@ -30,6 +30,7 @@ from plant.effects import (
     valve_null_bias,
 )
 from plant.parameters import (
+    ACTUATORS,
     AREA,
     FLOW_GAIN,
     LVDT_FACTOR,
@@ -74,6 +75,8 @@ __all__ = [
     "gains",
     "half_share",
     "load_of",
+    "loaded_by",
+    "nominal_compliance",
     "prepare",
     "remembered",
     "rest",
@@ -126,7 +129,7 @@ class _Drive(NamedTuple):
     a11 .. a22           the spool's exact step
     flow, p_ref          m/s at full spool and p_ref (Pa)
     overlap              -, of the valve's lands: its dead band
-    stiffness            N/m of the trapped oil
+    nominal, stiffness   m/N, compliance of the trapped oil without an effect; N/m with it
     per_p_ref, per_area, per_stroke  1/Pa, 1/m2, 1/m
     low, high            m, end stops
     lvdt_factor, lvdt_share     shares of the way that the LVDT's lags go in a step
@@ -141,6 +144,7 @@ class _Drive(NamedTuple):
     flow: float
     p_ref: float
     overlap: float
+    nominal: float
     stiffness: float
     per_p_ref: float
     per_area: float
@@ -164,9 +168,18 @@ class Feed(NamedTuple):
 
 
 @inlined
+def nominal_compliance(p: np.ndarray, j: int) -> float:
+    """Return the compliance (m/N) of the oil that lane ``j`` traps, without an effect; of two actuators, by the area of
+    this one.
+    """
+    return oil_compressibility.NOMINAL if p[ACTUATORS, j] == 0.0 else oil_compressibility.of_area(p[AREA, j])
+
+
+@inlined
 def _numbers(p: np.ndarray, j: int) -> _Drive:
     """Return what lane ``j`` of the parameters needs for its steps, but for the effects' own numbers."""
     low, high = end_stop_shift.step(p[STROKE, j], p[END_STOP_SHIFT, j])
+    nominal = nominal_compliance(p, j)
     return _Drive(
         p[RATED_CURRENT, j],
         p[VALVE_SHARE, j],
@@ -177,7 +190,8 @@ def _numbers(p: np.ndarray, j: int) -> _Drive:
         p[FLOW_GAIN, j],
         p[P_REF, j],
         p[VALVE_DEAD_BAND, j] / p[RATED_CURRENT, j],
-        1.0 / (oil_compressibility.NOMINAL + p[OIL_COMPRESSIBILITY, j]),
+        nominal,
+        1.0 / (nominal + p[OIL_COMPRESSIBILITY, j]),
         1.0 / p[P_REF, j],
         1.0 / p[AREA, j],
         1.0 / p[STROKE, j],
@@ -239,7 +253,8 @@ def rest(s: np.ndarray, p: np.ndarray, j: int, i_cmd: float, load: float) -> Non
     i = valve_null_bias.step(i_cmd, p[VALVE_NULL_BIAS, j])
     told(s, j, Plays(i, i, i, i))
     s[LAGGED, j] = i
-    s[GIVE, j] = oil_compressibility.step(load, 0.0, p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j])
+    compliance, drag = p[OIL_COMPRESSIBILITY, j], p[OIL_COMPRESSIBILITY + 1, j]
+    s[GIVE, j] = oil_compressibility.step(load, 0.0, compliance, drag, nominal_compliance(p, j))
 
 
 @inlined
@@ -295,6 +310,12 @@ def feed(d: Any, gain: float, load: float, p_s: float) -> Feed:
 
 
 @inlined
+def loaded_by(f: Feed, force: float) -> Feed:
+    """Return what is fed to a piston with a ``force`` (N, against extension) beside its load."""
+    return Feed(f.extending, f.retracting, f.root, f.load + force, f.half_share)
+
+
+@inlined
 def step(
     z: DriveState,
     d: Any,
@@ -339,7 +360,9 @@ def step(
         force = piston_friction.step(z.force, travel, level, d.stiffness / k)
         moved = force - z.force
         off_centre, back = piston_friction.recentre(z.off_centre, r * moved, abs(travel) * d.stiffness * f.half_share)
-        give = oil_compressibility.step(f.load, speed, d.oil_compressibility_compliance, d.oil_compressibility_drag)
+        give = oil_compressibility.step(
+            f.load, speed, d.oil_compressibility_compliance, d.oil_compressibility_drag, d.nominal
+        )
         travel += (give - z.give) - (k * moved + r * back) / d.stiffness
     else:
         speed = opening * (gain * f.root)

@@ -47,6 +47,7 @@ __all__ = [
     "RATED_CURRENT",
     "SIGNALS",
     "STROKE",
+    "UNISON_NAMES",
     "VALVE_A11",
     "VALVE_A12",
     "VALVE_A21",
@@ -162,4 +163,10 @@ MOTOR_STATE = (
     "speed_integral",  # A, integral part of the speed loop
     "motor_speed",  # rad/s
     "bent",  # m, by which the load bends screw and bearings
+)
+
+# ---- two actuators (`plant.unison`): their rows stand behind those
+UNISON_NAMES = (
+    "actuators.ring_stiffness",  # N m/rad
+    "actuators.pot_position",  # rad around the ring from where actuator A drives it
 )

@@ -58,6 +58,7 @@ __all__ = [
     "clevis_axial",
     "crank",
     "crank_angle",
+    "crank_slope",
     "paper_crank",
     "paper_ring",
     "paper_theta0",
@@ -68,6 +69,7 @@ __all__ = [
     "paper_vane",
     "ring_angle",
     "ring_angle_of_vane",
+    "ring_slope",
     "ring_tangent",
     "stage_ring_angle",
     "stage_vane_angle",
@@ -212,6 +214,31 @@ def vane_per_ring(theta5: float, ldp: float, l: float) -> float:  # noqa: E741
 
 
 @compiled
+def crank_slope(stroke: float, lx0: float, x1: float, y1: float, le: float) -> float:
+    """Slope d(th0 + th1) / d stroke of the crank, rad/m (`vane_slope`); 0 where it is held stretched or folded."""
+    lx = lx0 + stroke
+    d2 = x1 * x1 + y1 * y1
+    m = 0.5 * (d2 + le * le - lx * lx)
+    r = d2 * le * le - m * m
+    return 0.0 if r <= 0.0 else lx / math.sqrt(r)
+
+
+@compiled
+def ring_slope(turning: float, c: float, s: float, ax: float, ay: float, lb: float, lc: float, ld: float) -> float:
+    """Slope d th5 / d stroke of the ring, rad/m, of a crank in the direction (c, s) that is ``turning`` by
+    `crank_slope`; 0 where the linkage is held stretched or folded.
+    """
+    cos5, sin5 = _ring_direction(c, s, ax, ay, lb, lc, ld)
+    wx, wy = -sin5, cos5
+    px = ax + lb * c - ld * wx
+    py = ay + lb * s - ld * wy
+    turn = py * wx - px * wy
+    if abs(turn) < 1e-9 * ld:
+        return 0.0
+    return turning * lb * (py * c - px * s) / (ld * turn)
+
+
+@compiled
 def stage_ring_angle(stroke: float, g: np.ndarray, k: int) -> float:
     """Ring rotation th5 of stage k, rad, from stroke in m and the flat geometry g."""
     c, s = crank(stroke, g[G_LX0], g[G_X1], g[G_Y1], g[G_LE])
@@ -236,25 +263,14 @@ def vane_slope(stroke: float, g: np.ndarray, k: int) -> float:
     d thl = `vane_per_ring` d th5
     0 where the linkage is held stretched or folded.
     """
-    x1, y1, le = g[G_X1], g[G_Y1], g[G_LE]
     o = N_CRANK + k * N_PER_STAGE
-    lb, ld = g[o + G_LB], g[o + G_LD]
-    lx = g[G_LX0] + stroke
-    d2 = x1 * x1 + y1 * y1
-    m = 0.5 * (d2 + le * le - lx * lx)
-    r = d2 * le * le - m * m
-    if r <= 0.0:
+    turning = crank_slope(stroke, g[G_LX0], g[G_X1], g[G_Y1], g[G_LE])
+    c, s = crank(stroke, g[G_LX0], g[G_X1], g[G_Y1], g[G_LE])
+    ax, ay, lb, lc, ld = g[o + G_AX], g[o + G_AY], g[o + G_LB], g[o + G_LC], g[o + G_LD]
+    dring = ring_slope(turning, c, s, ax, ay, lb, lc, ld)
+    if dring == 0.0:
         return 0.0
-    c, s = crank(stroke, g[G_LX0], x1, y1, le)
-    cos5, sin5 = _ring_direction(c, s, g[o + G_AX], g[o + G_AY], lb, g[o + G_LC], ld)
-    wx, wy = -sin5, cos5
-    px = g[o + G_AX] + lb * c - ld * wx
-    py = g[o + G_AY] + lb * s - ld * wy
-    turn = py * wx - px * wy
-    if abs(turn) < 1e-9 * ld:
-        return 0.0
-    dring = lx / math.sqrt(r) * lb * (py * c - px * s) / (ld * turn)
-    return dring * vane_per_ring(math.atan2(sin5, cos5), g[o + G_LDP], g[o + G_L])
+    return dring * vane_per_ring(ring_angle(c, s, ax, ay, lb, lc, ld), g[o + G_LDP], g[o + G_L])
 
 
 @compiled

@@ -15,6 +15,7 @@ from plant.effects import EFFECTS, ROW, states_of
 from plant.geometry import Geometry, Schedules, load_schedules
 from plant.linkage import G_L, G_LDP, N_CRANK, N_PER_STAGE
 from plant.parameters import GEOMETRY, AnyPlantTable, Nominal, Supply, derive, load_plant, nominal
+from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import own_rows, same_stages
 
 __all__ = ["Additions", "Plant", "build_plant"]
@@ -25,8 +26,9 @@ class Plant:
     """One machine.
 
     table, geometry, schedules  the tables it came from
-    p      float64[N_PARAMETERS, 1], SI, derived rows included
-    sigma  float64[2 + stages]: rms noise of LVDT (m), each potentiometer (rad), speed (%)
+    p      float64[N_PARAMETERS, actuators], SI, derived rows included; of two, A's numbers, then B's
+    sigma  float64[2 + stages]: rms noise of LVDT (m), each potentiometer (rad), speed (%); one more of two actuators,
+           that of B's LVDT
     """
 
     table: AnyPlantTable
@@ -39,6 +41,16 @@ class Plant:
     def kind(self) -> str:
         """Kind of its actuator, one of `plant.effect.KINDS`."""
         return self.table.actuator.kind
+
+    @property
+    def sides(self) -> int:
+        """How many actuators it has."""
+        return self.table.sides
+
+    def of_one_actuator(self, what: str) -> None:
+        """Refuse a machine with two actuators: InputError in one line, for ``what`` takes one alone."""
+        if self.sides != 1:
+            raise InputError(f"plant table: actuators.number (={self.sides}) must be 1 for {what} (docs/machines.md)")
 
     @property
     def usual(self) -> dict[str, float]:
@@ -89,7 +101,7 @@ class Plant:
         """Return a state at rest at ``stroke`` (m), speed ``n_r`` (%) and ``t_oil`` (degC), every ring in the middle of
         its play.
         """
-        s = np.zeros((chain.N_STATE, 1))
+        s = np.zeros((chain.N_STATE, self.sides))
         chain.rest(s, self.p, 0, stroke, n_r, t_oil)
         return s
 
@@ -126,6 +138,8 @@ def build_plant(
     sigma = np.array(
         [sensors.lvdt_noise.value * 1e-3, *[sensors.pot_noise.value * deg] * len(geo.vanes), sensors.speed_noise.value]
     )
+    if table.sides == 2:
+        sigma = np.append(sigma, sigma[0])
     targets = load_schedules(schedules)
     same_stages(**{str(geometry): geo.vanes, str(schedules): targets.vanes})
     plant = Plant(table, geo, targets, p, sigma)

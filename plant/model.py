@@ -21,6 +21,9 @@ command as ``--model``.
     high = 64.9
     knots = [15.2, 15.2, 15.2, 15.2, 64.9, 64.9, 64.9, 64.9]
     values = [-0.61, -0.2, 0.2, 0.29]
+
+    [side_b.effects.internal_leakage]       # of two actuators, what B alone has, in place of what both have; side_a
+    coefficient = 5.0                       # likewise. Effects and parameters of valve, actuator and LVDT
 """
 
 from __future__ import annotations
@@ -208,6 +211,13 @@ class Learned(Table):
         return lambda values: (a @ np.reshape(values, shape) @ b.T).ravel()[nearest].reshape(SIDE, SIDE)
 
 
+class Side(Table):
+    """What one of two actuators, with its valve and its LVDT, has beyond the tables: as `Model` has it of both."""
+
+    parameters: dict[str, Finite] = Field(default_factory=dict)
+    effects: dict[str, dict[str, Finite]] = Field(default_factory=dict)
+
+
 class Model(Table):
     """What a machine has beyond its tables.
 
@@ -215,12 +225,15 @@ class Model(Table):
     effects     name of an effect -> its parameters, in their declared units
     meta        free text and lists of it
     curves      effects that are functions which were learned
+    side_a, side_b  what one of two actuators has, in place of what both have
     """
 
     parameters: dict[str, Finite] = Field(default_factory=dict)
     effects: dict[str, dict[str, Finite]] = Field(default_factory=dict)
     meta: dict[str, str | bool | int | float | list[str]] = Field(default_factory=dict)
     curves: dict[str, Learned] = Field(default_factory=dict)
+    side_a: Side = Side()
+    side_b: Side = Side()
 
     @model_validator(mode="before")
     @classmethod
@@ -236,44 +249,66 @@ class Model(Table):
         lines = [*(history if isinstance(history, list) else [str(history)]), command]
         return self.model_copy(update={"meta": {**self.meta, "history": lines}})
 
+    @property
+    def sides(self) -> dict[str, Side]:
+        """What one of two actuators has that both have not, of those that have such a thing; side A's first."""
+        sides = {"side_a": self.side_a, "side_b": self.side_b}
+        return {name: side for name, side in sides.items() if side.parameters or side.effects}
+
     def check(self, plant: Plant, source: str | Path = "model") -> None:
         """Refuse what is not in the library or out of bounds: InputError in one line, naming ``source``."""
         if system := self.meta.get("system"):
             raise InputError(f"{source}: is a model of the system {system!r}; --system says where that is")
         self._check_curves(plant, source)
+        self._check_part(plant, f"{source}: ", self)
+        for name, side in self.sides.items():
+            if plant.sides != 2:
+                raise InputError(f"{source}: {name}: this machine has one actuator")
+            for key in (*side.parameters, *side.effects):
+                if not _of_a_side(key):
+                    raise InputError(
+                        f"{source}: {name}: {key!r} is not of one side; allowed: parameters and effects of valve, "
+                        f"actuator and LVDT, but for aero_load"
+                    )
+            self._check_part(plant, f"{source}: {name}: ", side)
+
+    def _check_part(self, plant: Plant, source: str, part: Model | Side) -> None:
+        """`check` of parameters and effects."""
         known = {n.name: n for n in plant.nominal}
-        for name, value in self.parameters.items():
+        for name, value in part.parameters.items():
             if name not in known:
                 raise InputError(
-                    f"{source}: parameters: {name!r} is {_not(name, plant, known)}; allowed: {', '.join(known)}"
+                    f"{source}parameters: {name!r} is {_not(name, plant, known)}; allowed: {', '.join(known)}"
                 )
             n = known[name]
             low, high = allowed_of(plant, n)
-            _within(value, low, high, n.unit, f"{source}: parameters: {name}")
-        for effect, values in self.effects.items():
+            _within(value, low, high, n.unit, f"{source}parameters: {name}")
+        for effect, values in part.effects.items():
             if effect in self.curves:
                 continue
             if effect not in EFFECTS:
                 raise InputError(
-                    f"{source}: effects: {effect!r} is unknown{_meant(effect, EFFECTS)}; docs/effects.md lists them"
+                    f"{source}effects: {effect!r} is unknown{_meant(effect, EFFECTS)}; docs/effects.md lists them"
                 )
             if plant.kind not in EFFECTS[effect].kinds:
                 kinds = ", ".join(EFFECTS[effect].kinds)
                 raise InputError(
-                    f"{source}: effects: {effect!r} is of an actuator of kind {kinds}; this machine's is {plant.kind}"
+                    f"{source}effects: {effect!r} is of an actuator of kind {kinds}; this machine's is {plant.kind}"
                 )
             allowed = {p.name: p for p in plant.parameters_of(effect).values()}
             for key, value in values.items():
                 if key not in allowed:
                     raise InputError(
-                        f"{source}: effects.{effect}: {key!r} is {_not(key, plant, allowed)}; allowed: "
+                        f"{source}effects.{effect}: {key!r} is {_not(key, plant, allowed)}; allowed: "
                         f"{', '.join(allowed)}"
                     )
                 p = allowed[key]
-                _within(value, p.low, p.high, p.unit, f"{source}: effects.{effect}.{key}")
+                _within(value, p.low, p.high, p.unit, f"{source}effects.{effect}.{key}")
 
     def _check_curves(self, plant: Plant, source: str | Path) -> None:
         """Refuse curves that this machine has no place or quantity for."""
+        if self.curves:
+            plant.of_one_actuator(f"the curves of {source}")
         if len(self.curves) > MOST_CURVES:
             raise InputError(f"{source}: curves (={len(self.curves)}) must be at most {MOST_CURVES}")
         for name, curve in self.curves.items():
@@ -313,24 +348,38 @@ class Model(Table):
         machine = base or build_plant()
         self.check(machine)
         p = machine.p.copy()
+        self._put(p, machine, self)
+        for name, side in self.sides.items():
+            lane = ("side_a", "side_b").index(name)
+            self._put(p[:, lane : lane + 1], machine, side)
+        derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
+        if not np.isfinite(p).all():
+            raise InputError("model: a number that follows from its parameters, effects or curves is not finite")
+        return replace(machine, p=p)
+
+    def _put(self, p: np.ndarray, machine: Plant, part: Model | Side) -> None:
+        """Put parameters and effects into ``p``."""
         known = {n.name: n for n in machine.nominal}
-        for name, value in self.parameters.items():
+        for name, value in part.parameters.items():
             row = known[name].row
             p[row] = value * known[name].si
             if PLAY <= row < PLAY + MOST:  # declared at the vane, used at the ring
                 ldp, lever = machine.lever(row - PLAY)
                 p[row] *= lever / ldp
-        for effect, values in self.effects.items():
+        for effect, values in part.effects.items():
             if effect in self.curves:
-                with np.errstate(over="ignore", invalid="ignore"):  # refused below
+                with np.errstate(over="ignore", invalid="ignore"):  # refused by `plant`
                     put_curve(p, self.curves[effect], values)
                 continue
             for row, parameter in machine.parameters_of(effect).items():
                 p[row] = values.get(parameter.name, parameter.neutral) * parameter.si
-        derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
-        if not np.isfinite(p).all():
-            raise InputError("model: a number that follows from its parameters, effects or curves is not finite")
-        return replace(machine, p=p)
+
+
+def _of_a_side(name: str) -> bool:
+    """Whether a parameter or an effect can be that of one of two actuators."""
+    if name in EFFECTS:
+        return EFFECTS[name].site in ("valve", "actuator", "lvdt") and name != "aero_load"
+    return name.startswith(("valve.", "actuator.")) or name == "sensors.lvdt_lag" or "." not in name
 
 
 def put_curve(p: np.ndarray, curve: Learned, values: Mapping[str, float]) -> None:
@@ -362,21 +411,30 @@ def text_of(model: Model) -> str:
     lines = []
     if model.meta:
         lines += ["[meta]", *(f"{_key(k)} = {json.dumps(v, ensure_ascii=False)}" for k, v in model.meta.items()), ""]
-    if model.parameters:
-        lines += ["[parameters]", *(f"{_key(k)} = {float(v)!r}" for k, v in model.parameters.items()), ""]
-    for effect, values in model.effects.items():
-        units = {p.name: p.unit for p in EFFECTS[effect].parameters} if effect in EFFECTS else {}
-        lines += [
-            f"[effects.{_key(effect)}]",
-            *(f"{_key(k)} = {float(v)!r}{f'  # {units[k]}' if k in units else ''}" for k, v in values.items()),
-            "",
-        ]
+    lines += _lines_of(model)
+    for name, side in model.sides.items():
+        lines += _lines_of(side, f"{name}.")
     for name, curve in model.curves.items():
         of = curve.model_dump(exclude_defaults=True)
         for key, axis in ((_key(name), of), (f"{_key(name)}.second", of.pop("second", {}))):
             rows = [f"{k} = {json.dumps(v, ensure_ascii=False)}" for k, v in axis.items()]
             lines += [f"[curves.{key}]", *rows, ""] if rows else []
     return "\n".join(lines)
+
+
+def _lines_of(part: Model | Side, at: str = "") -> list[str]:
+    """Lines of parameters and effects, in tables whose names begin with ``at``."""
+    lines = []
+    if part.parameters:
+        lines += [f"[{at}parameters]", *(f"{_key(k)} = {float(v)!r}" for k, v in part.parameters.items()), ""]
+    for effect, values in part.effects.items():
+        units = {p.name: p.unit for p in EFFECTS[effect].parameters} if effect in EFFECTS else {}
+        lines += [
+            f"[{at}effects.{_key(effect)}]",
+            *(f"{_key(k)} = {float(v)!r}{f'  # {units[k]}' if k in units else ''}" for k, v in values.items()),
+            "",
+        ]
+    return lines
 
 
 def _key(name: str) -> str:
@@ -419,6 +477,6 @@ def _bound(plant: Plant, name: str) -> Bound:
     if section == "linkage":
         fields: Any = Stage.model_fields["hysteresis" if key.endswith("_play") else key.split("_", 1)[1]]
     else:
-        table: Any = type(plant.table).model_fields[section].annotation
+        table: Any = type(getattr(plant.table, section))
         fields = table.model_fields["pot_bias" if key.endswith("_bias") else key]
     return next(m for m in fields.metadata if isinstance(m, Bound))

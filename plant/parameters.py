@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic import BaseModel, model_validator
 
 from plant.curve import LOAD_ADDS, acts
 from plant.effect import KINDS
-from plant.effects import CURVES, DERIVED, MOTOR, N_PARAMETERS, NEUTRAL, ROW, pot_lag, rows_at
+from plant.effects import CURVES, DERIVED, MOTOR, N_PARAMETERS, NEUTRAL, ROW, UNISON, pot_lag, rows_at
 from plant.geometry import Geometry, length_tolerances, load_geometry
 from plant.layout import (
     ACCELERATION,
@@ -36,6 +36,7 @@ from plant.layout import (
     POT_LAG,
     RATED_CURRENT,
     STROKE,
+    UNISON_NAMES,
     VALVE_A11,
     VALVE_A12,
     VALVE_A21,
@@ -52,6 +53,7 @@ from vaneloop.base.vanes import VANES, own_rows
 
 __all__ = [
     "ACCELERATION",
+    "ACTUATORS",
     "AMPLIFIER_SHARE",
     "AREA",
     "BANDWIDTH",
@@ -80,11 +82,13 @@ __all__ = [
     "POT_BIAS",
     "POT_FACTOR",
     "POT_LAG",
+    "POT_POSITION",
     "POT_SHARE",
     "P_REF",
     "RATED_CURRENT",
     "RATED_SPEED",
     "RESISTANCE",
+    "RING_STIFFNESS",
     "SCREW_EFFICIENCY",
     "SCREW_FRICTION",
     "SCREW_LEAD",
@@ -148,6 +152,9 @@ KIND = MOTOR  # number in `KINDS`
 ) = range(KIND + 1, KIND + 1 + len(MOTOR_NAMES))
 CURRENT_SHARE = VOLTAGE + 1  # share of the way that current loop and amplifier_lag go in a motor's step
 AMPLIFIER_SHARE = VOLTAGE + 2
+# rows of a machine with two actuators
+ACTUATORS = UNISON  # how many: 2, side B's numbers in the next lane; 0: one
+RING_STIFFNESS, POT_POSITION = range(UNISON + 1, UNISON + 1 + len(UNISON_NAMES))  # N m/rad; rad
 MOTOR_STEP = 2.5e-4  # s, the longest step of a motor; a longer plant step, as the search takes, is divided
 
 _SI = {"mm": 1e-3, "mA": 1e-3, "ms": 1e-3, "MPa": 1e6, "N/um": 1e6, "deg": math.pi / 180.0}
@@ -198,14 +205,55 @@ class Sensors(Bounded):
     speed_noise: Annotated[Quantity, Bound("%", 0.0, 10.0)]
 
 
+class SideB(Bounded):
+    """Numbers of actuator B, its valve and its LVDT that differ from those of A."""
+
+    bandwidth: Annotated[Quantity | None, Bound("Hz", 1.0, 400.0)] = None
+    damping: Annotated[Quantity | None, Bound("-", 0.05, 0.99)] = None
+    flow_gain: Annotated[Quantity | None, Bound("m/s", 1e-3, 10.0)] = None
+    lvdt_lag: Annotated[Quantity | None, Bound("ms", 0.01, 1000.0)] = None
+
+
+class Actuators(Bounded):
+    """How many actuators drive the vanes, and what joins two (`plant.unison`).
+
+    feed  what feeds them: "a valve each", both under the same current
+    b     what differs at side B
+    """
+
+    number: Annotated[Quantity, Bound("-", 1.0, 2.0)]
+    feed: Literal["a valve each"] = "a valve each"
+    ring_stiffness: Annotated[Quantity | None, Bound("N m/rad", 0.0, 1e7)] = None
+    pot_position: Annotated[Quantity | None, Bound("deg", 0.0, 360.0)] = None
+    b: SideB = SideB()
+
+    @model_validator(mode="after")
+    def _whole(self) -> Actuators:
+        if self.number.value not in (1.0, 2.0):
+            raise ValueError(f"number (={self.number.value:g}) must be 1 or 2")
+        if self.number.value == 2.0 and (key := next((k for k in _JOINED if getattr(self, k) is None), None)):
+            raise ValueError(f"key {key!r} is missing; two actuators need {', '.join(_JOINED)}")
+        return self
+
+
+_JOINED = tuple(name.split(".")[1] for name in UNISON_NAMES)
+_OF_B = {"bandwidth": BANDWIDTH, "damping": DAMPING, "flow_gain": FLOW_GAIN, "lvdt_lag": LVDT_LAG}  # rows of p
+
+
 class PlantTable(Table):
-    """``plant.toml``: the machine with the hydraulic actuator."""
+    """``plant.toml``: the machine with the hydraulic actuator, or two of them (``plant_two_actuators.toml``)."""
 
     engine: Engine
     valve: Valve
     actuator: Actuator
+    actuators: Actuators | None = None
     supply: Supply
     sensors: Sensors
+
+    @property
+    def sides(self) -> int:
+        """How many actuators it has."""
+        return 1 if self.actuators is None else int(self.actuators.number.value)
 
 
 class MotorActuator(Bounded):
@@ -271,6 +319,11 @@ class ElectromechanicalTable(Table):
     supply: Bus
     sensors: Sensors
 
+    @property
+    def sides(self) -> int:
+        """How many actuators it has."""
+        return 1
+
 
 AnyPlantTable = PlantTable | ElectromechanicalTable  # told apart by [actuator] kind
 _TABLES: dict[str, type[PlantTable] | type[ElectromechanicalTable]] = dict(
@@ -330,7 +383,10 @@ def nominal(table: AnyPlantTable, geometry: Geometry) -> list[Nominal]:
     These two stand for all lengths of the linkage, and so does their tolerance (`plant.geometry.length_tolerances`).
     """
     out = []
-    for name, row in names_of(table.actuator.kind, geometry.vanes).items():
+    rows = names_of(table.actuator.kind, geometry.vanes)
+    if table.sides == 2:
+        rows |= {name: UNISON + 1 + i for i, name in enumerate(UNISON_NAMES)}
+    for name, row in rows.items():
         section, key = name.split(".")
         if section == "linkage":
             q = geometry.stage(key.removesuffix("_play")).hysteresis
@@ -387,6 +443,8 @@ def derive_lane(p: np.ndarray, j: int, dt: float, tick: float) -> None:
     p[DRIVE_EFFECTS, j] = 1.0 if p[KIND, j] != 0.0 else changed(p, j, _DRIVE_ROWS)
     p[DRIVE_LOADED, j] = changed(p, j, _LOAD_ROWS)
     p[VANE_EFFECTS, j] = changed(p, j, _VANE_ROWS)
+    if p[ACTUATORS, j] != 0.0:  # nor have two actuators
+        p[DRIVE_EFFECTS, j] = p[DRIVE_LOADED, j] = p[VANE_EFFECTS, j] = 1.0
     if p[CURVES, j] != 0.0:  # nor have curves
         p[DRIVE_EFFECTS, j] = p[VANE_EFFECTS, j] = 1.0
         if acts(p, j, LOAD_ADDS):
@@ -413,7 +471,7 @@ def load_plant(
 ) -> tuple[AnyPlantTable, Geometry, np.ndarray]:
     """Read, check and flatten the plant's tables.
 
-    Returns the two tables and p, float64[N_PARAMETERS, 1] in SI, without the derived rows (`derive`).
+    Returns the two tables and p, float64[N_PARAMETERS, actuators] in SI, without the derived rows (`derive`).
     The play's width at the ring is the published width at the vane over the lever's ratio Ld'/L at mid-stroke.
     Raises InputError with file, key, value and what is allowed.
     """
@@ -430,4 +488,10 @@ def load_plant(
         p[PLAY + k, 0] = g[o + G_HYSTERESIS] * g[o + G_L] / g[o + G_LDP]
     p[N_NOMINAL:DERIVED, 0] = NEUTRAL
     p[LVDT_STEP, 0] = table.sensors.lvdt_range.value * 1e-3 / 2.0**table.sensors.lvdt_bits.value
+    if isinstance(table, PlantTable) and table.actuators is not None and table.sides == 2:
+        p[ACTUATORS, 0] = 2.0
+        p = np.repeat(p, 2, axis=1)  # side B is as A, but for:
+        for key, row in _OF_B.items():
+            if (q := getattr(table.actuators.b, key)) is not None:
+                p[row, 1] = q.value * _SI.get(q.unit, 1.0)
     return table, geo, p

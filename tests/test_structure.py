@@ -195,6 +195,7 @@ EXPORTS: dict[str, list[str]] = {
         "SIGNAL_AT",
         "STATE",
         "STATE_ROW",
+        "UNISON",
         "rows_at",
         "states_of",
     ],

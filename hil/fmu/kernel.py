@@ -196,6 +196,7 @@ def entry(part: str, shape: Shape) -> Callable[..., None]:
             _view(m, o_angles, (stages,)),
             _view(m, o_in, (0, 1)),
             _view(m, o_in, (0,)),
+            _view(m, o_in, (0,)),
             _view(m, o_sent, (n_sent, 4)),
             (),
         )

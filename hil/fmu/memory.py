@@ -80,8 +80,9 @@ def places_of(shape: Shape) -> dict[str, Place]:
 
 def first(plant: Plant, calibration: Calibration) -> tuple[Shape, np.ndarray]:
     """Return the sizes of a machine, and its memory before the start: parameters and calibration in place, all else
-    neutral.
+    neutral. Raises InputError for a machine with two actuators.
     """
+    plant.of_one_actuator("an FMU")
     shape = Shape(len(plant.vanes), calibration.table.shape[1], calibration.angles.shape[1])
     places = places_of(shape)
     m = np.zeros(places["end"].at)

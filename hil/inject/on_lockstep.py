@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -75,24 +75,25 @@ class MachineChange:
         self.supply = {i: v for i, v in ((0, action.p_s), (1, action.t_oil)) if v is not None}
         if 0 in self.supply:
             self.supply[0] *= 1e6
-        self.old: tuple[dict[int, float], dict[int, float]] = ({}, {})
+        self.old: tuple[dict[int, Any], dict[int, float]] = ({}, {})
 
     def tick(self, k: int) -> None:
         """Change the machine at the first tick, and back at the end."""
         if k == self.first:
-            self.old = ({r: float(self.loop.p[r, 0]) for r in self.new}, {i: float(self.fed[i]) for i in self.supply})
+            self.old = ({r: self.loop.p[r].copy() for r in self.new}, {i: float(self.fed[i]) for i in self.supply})
             self._set(self.new, self.supply)
         elif k == self.end:
             self._set(*self.old)
 
-    def _set(self, rows: dict[int, float], supply: dict[int, float]) -> None:
+    def _set(self, rows: Mapping[int, Any], supply: dict[int, float]) -> None:
+        """Put these numbers into rows of p, one for all actuators or one for each, and into the supply."""
         for i, v in supply.items():
             self.fed[i] = v
         if rows:
             chain.wake(self.loop.s, self.loop.p, 0, self.loop.given.i_cmd)
             for p in (self.loop.p, self.engine.p):
                 for r, v in rows.items():
-                    p[r, 0] = v
+                    p[r] = v
                 derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
 
 

@@ -40,7 +40,7 @@ from controller.records import (
 from controller.schedule import look_up
 from controller.strategies import filter_pots, inverse_step, learn
 from hil.loop.lockstep import S_FRESH, S_MODE_REQUEST, S_N_DEM, S_N_R, S_P_S, S_REJECTED, S_T_OIL
-from plant import chain, curve
+from plant import chain, curve, unison
 from plant.chain import SUBSTEPS, TICK, drive_step, rotor_step, sample_lvdt, vane_step
 from plant.effects import CURVES
 from plant.places import N_R, POT, X
@@ -130,7 +130,12 @@ def _same(row: Any) -> Any:
 
 
 def _nothing(*_: Any) -> None:
-    """What only strategies inverse and adaptive, curves and motors need: these engines have none."""
+    """What only strategies inverse and adaptive, curves, motors and second actuators need: these engines have none."""
+
+
+def _still(s: Any, p: Any, j: int, k: int) -> tuple[float, float]:
+    """What a second actuator makes of a ring; these engines have none."""
+    return 0.0, 0.0
 
 
 def _zero(s: Any, p: Any, j: int, site: int) -> float:
@@ -281,7 +286,9 @@ class Kernel:
         if isinstance(self.name, bytes):
             self.name = self.name.decode()
         instead: dict[Any, Any] = dict.fromkeys((as_inputs, as_outputs, as_scalars, as_state), _same)
-        instead |= dict.fromkeys((inverse_step, learn, filter_pots, curve.acts, chain._motor_step), _nothing)
+        absent = (inverse_step, learn, filter_pots, curve.acts, chain._motor_step, chain._joined_step)
+        instead |= dict.fromkeys(absent, _nothing)
+        instead[unison.ring_at] = _still
         instead[curve.bend] = _zero
         if not self.simulated:
             instead[np.floor] = math.floor  # on a GPU it gives a floating-point number, of infinity too

@@ -22,7 +22,7 @@ from hil.loop.lockstep import CHUNK, S_N_DEM, S_N_R, S_T_OIL, WARM_UP, Run, Stim
 from hil.loop.tick import CHANGED_BY, flashed, mean_stroke
 from plant import Plant, chain, places
 from plant.effects import CURVES
-from plant.parameters import KIND
+from plant.parameters import ACTUATORS, KIND
 from vaneloop.base.compiled import in_place, threads
 from vaneloop.base.errors import InputError
 
@@ -32,8 +32,9 @@ DEVICES = ("auto", "cpu", "cuda")
 AT_ONCE = 128  # engines whose logs the processor has at once, for each of its cores
 MOST = 1 << 17  # engines on a GPU at once: several for each of its threads; the host builds what the next ones need
 SHARE = 0.8  # of the GPU's free memory
-# rows of p that are 0 in an engine for the GPU: the kernel has no motor, no curves and no frames of the past
-ELSEWHERE = [KIND, CURVES, places.CAN_DELAY, places.FRAME_HOLD]
+# rows of p that are 0 in an engine for the GPU: the kernel has no motor, no second actuator, no curves and no frames of
+# the past
+ELSEWHERE = [KIND, ACTUATORS, CURVES, places.CAN_DELAY, places.FRAME_HOLD]
 DEG = 180.0 / np.pi
 
 
@@ -178,7 +179,7 @@ class _Work:
 
 def _stages(plant: Plant) -> int:
     """How many vane stages a machine has."""
-    return len(plant.sigma) - 2
+    return len(plant.vanes)
 
 
 @in_place

@@ -36,6 +36,7 @@ WARM_UP = 1_000  # ticks before t = 0 with the first frame held: the controller 
 _BORDER = {  # columns before those of the vanes -> factor from SI into border units
     "t": 1.0, "n_dem": 1.0, "n_r": 1.0, "x_dem": 1e3, "x_lvdt": 1e3, "i_cmd": 1e3, "p_s": 1e-6, "t_oil": 1.0
 }  # fmt: skip
+_SIDES = ("x_lvdt_a", "x_lvdt_b")  # mm, of a machine with two actuators
 VIGV = len(_BORDER)  # column of the first stage
 
 # columns of a stimulus
@@ -119,8 +120,9 @@ def advance(
 ) -> None:
     """Advance the loop ``a`` (`hil.loop.tick.Loop`) by ``ticks`` ticks from tick ``k0``, a multiple of 10.
 
-    noise      float64[ticks or 1, 2 + stages] standard normal numbers (LVDT, each potentiometer, speed)
-    out        float64[rows or 0, 10 + stages, with a motor one more] in SI, a row every ``every`` ticks (`columns_of`)
+    noise      float64[ticks or 1, sensors] standard normal numbers, in the order of `Loop.sigma`
+    out        float64[rows or 0, 10 + stages, with a motor one more, with two actuators two] in SI, a row every
+               ``every`` ticks (`columns_of`)
     snapshots  float64[ticks or 0, n] copies of the whole state that the machine has, at each tick (`snapshot_names`)
     """
     z, s, inputs, given = a.z, a.s, as_inputs(a.inputs), as_outputs(a.outputs)
@@ -158,30 +160,36 @@ def advance(
                 out[r, VIGV + q] = a.angles[q]
             out[r, VIGV + stages] = given.mode
             out[r, VIGV + stages + 1] = s[places.N_R, 0]
-            if out.shape[1] > VIGV + stages + 2:
+            if a.sides.shape[0] > 0:
+                out[r, VIGV + stages + 2], out[r, VIGV + stages + 3] = a.sides[0], a.sides[1]
+            elif out.shape[1] > VIGV + stages + 2:
                 out[r, VIGV + stages + 2] = s[places.I_MOTOR, 0]
         if keep:
             for q in range(n_z):
                 snapshots[i, q] = z[a.z_rows[q]]
             for q in range(n_s):
-                snapshots[i, n_z + q] = s[a.s_rows[q], 0]
+                for side in range(s.shape[1]):
+                    snapshots[i, n_z + side * n_s + q] = s[a.s_rows[q], side]
         move(k, a, n_dem, n_r, p_s, t_oil)
 
 
-def columns_of(vanes: tuple[str, ...], motor: bool = False) -> tuple[str, ...]:
-    """Names of a run's columns, of a machine with these stages, and with a motor or without."""
-    return (*_BORDER, *vanes, "state", "n_engine", *(("i_motor",) if motor else ()))
+def columns_of(vanes: tuple[str, ...], motor: bool = False, two: bool = False) -> tuple[str, ...]:
+    """Names of a run's columns, of a machine with these stages, with a motor or without, with two actuators or one."""
+    return (*_BORDER, *vanes, "state", "n_engine", *(("i_motor",) if motor else ()), *(_SIDES if two else ()))
 
 
 def to_border(out: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Return the columns ``out[:, i]`` (SI) with their ``names`` (`columns_of`) in border units."""
-    factor = {**_BORDER, **dict.fromkeys(VANES, 180.0 / np.pi)}
+    factor = {**_BORDER, **dict.fromkeys(VANES, 180.0 / np.pi), **dict.fromkeys(_SIDES, 1e3)}
     return {name: np.ascontiguousarray(out[:, i] * factor.get(name, 1.0)) for i, name in enumerate(names)}
 
 
 def snapshot_names(plant: Plant) -> list[str]:
-    """Names of the numbers whose digest is the state hash: the firmware's, then the plant's, that this machine has."""
-    return [*(STATE[i] for i in own_rows(STATE, plant.vanes)), *(chain.STATE[row] for row in plant.rows)]
+    """Names of the numbers whose digest is the state hash: the firmware's, then the plant's, that this machine has;
+    of two actuators then those of side B.
+    """
+    firmware, of_a = [STATE[i] for i in own_rows(STATE, plant.vanes)], [chain.STATE[row] for row in plant.rows]
+    return [*firmware, *of_a, *(f"b_{name}" for name in of_a if plant.sides == 2)]
 
 
 @lru_cache(maxsize=1)
@@ -237,7 +245,8 @@ def lockstep(
     state, s = loop.state, loop.s
     state.direction, state.blend = _starting_curve(loop.calibration, n0, stroke_demand)
     generator = np.random.Generator(np.random.PCG64(seed if seed is not None else 0))
-    names, sensors = columns_of(machine.vanes, machine.kind == "electromechanical"), len(machine.sigma)
+    names = columns_of(machine.vanes, machine.kind == "electromechanical", machine.sides == 2)
+    sensors = len(machine.sigma)
     silent = np.zeros((1, sensors))
     advance(-WARM_UP, WARM_UP, rows[:1], silent, loop, 10, np.empty((0, len(names))), np.empty((0, 0)))
     loop.mean[:] = 0.0
@@ -245,7 +254,7 @@ def lockstep(
         machine.place_rings(s, angles, n0, t_oil)
 
     out = np.empty((-(-ticks // every), len(names)))
-    wide = len(loop.z_rows) + len(loop.s_rows)
+    wide = len(loop.z_rows) + loop.s.shape[1] * len(loop.s_rows)
     buffers = [np.empty((CHUNK if hashed or watch is not None else 0, wide)) for _ in range(2)]
     digest = hashlib.sha256()
     started = time.perf_counter()

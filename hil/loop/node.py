@@ -444,7 +444,7 @@ class Ecu:
             machine.start(stroke=0.0, n_r=n_dem),
             machine.p.copy(),
             np.array([n_dem, np.nan, float(mode_request)]),
-            np.array([machine.sigma[-1] if seed is not None else 0.0]),
+            np.array([machine.sigma[1 + len(machine.vanes)] if seed is not None else 0.0]),
             receivers,
             np.full(len(ECU_VALUES), np.nan),
             np.zeros(1, np.int64),

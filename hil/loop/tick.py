@@ -59,12 +59,15 @@ class Loop(NamedTuple):
     flash        float64[3] those effects' parameters, as flashed
     s, p         the plant's state and parameters
     z_rows, s_rows  int64: numbers of z and rows of s that this machine has; the others are of stages it lacks
-    sigma        float64[2 + stages] rms noise of the sensors, SI (LVDT, each potentiometer, speed); zeros = noise-free
+    sigma        float64[2 + stages] rms noise of the sensors, SI (LVDT, each potentiometer, speed; of two actuators,
+                 B's LVDT); zeros = noise-free
     mean         float64[2] sum and number of currents since the last one that was logged or sent
     angles       float64[stages] rad, the potentiometers' readings at this tick
     pots         float64[frames or 0, 2 stages] what the controller gets of each reading: share of it and offset
                  (rad; NaN = not fitted), stage by stage, a row every 10 ms, the last one held
     lvdt         float64[0 or 1] stroke (m) that the controller gets in place of the LVDT's; NaN: the LVDT's
+    sides        float64[0, or 2 of two actuators] m, the LVDTs' readings of A and B at this tick; the controller gets
+                 their mean
     sent         float64[KEPT, 4] contents of good frames: number of the 10 ms in which it came, n_dem, n_r (%),
                  mode_request
     foreign      a controller of the user's own (`hil.native.call.Foreign`); (): the firmware here
@@ -85,6 +88,7 @@ class Loop(NamedTuple):
     angles: np.ndarray
     pots: np.ndarray
     lvdt: np.ndarray
+    sides: np.ndarray
     sent: np.ndarray
     foreign: Any = ()
 
@@ -133,11 +137,12 @@ def new_loop(
         plant.p.copy(),
         state_rows(stages),
         plant.rows,
-        plant.sigma.copy() if noisy else np.zeros(2 + stages),
+        plant.sigma.copy() if noisy else np.zeros_like(plant.sigma),
         np.zeros(2),
         np.zeros(stages),
         np.empty((0, 2 * stages)) if pots is None else np.ascontiguousarray(pots, dtype=np.float64),
         np.full(1, np.nan),
+        np.full(plant.sides if plant.sides > 1 else 0, stroke),
         np.full((KEPT, 4), np.nan),
         foreign,
     )
@@ -243,7 +248,7 @@ def hear(
     fresh  1: a good frame; 0: none came.  rejected: frames refused
     """
     if n_r != n_r:
-        n_r = a.s[places.N_R, 0] + a.sigma[a.sigma.shape[0] - 1] * noise
+        n_r = a.s[places.N_R, 0] + a.sigma[1 + a.angles.shape[0]] * noise
     inputs = as_inputs(a.inputs)
     inputs.demand_fresh = fresh
     inputs.demand_rejected = rejected
@@ -256,11 +261,16 @@ def hear(
 def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
     """Sample the sensors and run the firmware at tick ``k``.
 
-    noise  float64[:, 2 + stages] standard normal numbers (LVDT, each potentiometer, speed), this tick's in ``row``
+    noise  float64[:, sensors] standard normal numbers in the order of `Loop.sigma`, this tick's in ``row``
     """
     s, p, inputs, sigma = a.s, a.p, as_inputs(a.inputs), a.sigma
     reflash(a)
     inputs.x_lvdt = chain.sample_lvdt(s, p, 0, sigma[0] * noise[row, 0], t_oil)
+    if a.sides.shape[0] > 0:
+        last = a.angles.shape[0] + 2
+        a.sides[0] = inputs.x_lvdt
+        a.sides[1] = chain.sample_lvdt(s, p, 1, sigma[last] * noise[row, last], t_oil)
+        inputs.x_lvdt = 0.5 * (a.sides[0] + a.sides[1])
     if a.lvdt.shape[0] > 0 and a.lvdt[0] == a.lvdt[0]:
         inputs.x_lvdt = a.lvdt[0]
     for q in range(a.angles.shape[0]):

@@ -2,7 +2,7 @@
 
 An effect's parameters follow the nominal plant's in p, its states the nominal ones in s, in the alphabetical order of
 the files. A new file shifts the rows behind it; nothing else in the plant has numbers of rows in it. Behind them all
-stands what only an electromechanical actuator has.
+stands what only an electromechanical actuator has, then what only two actuators have, then learned curves.
 """
 
 from __future__ import annotations
@@ -11,12 +11,21 @@ import importlib
 import pkgutil
 
 from plant.effect import Effect
-from plant.layout import CURVE_ROWS, MOST_CURVES, MOTOR_NAMES, MOTOR_STATE, N_NOMINAL, NOMINAL_STATE, SIGNALS
+from plant.layout import (
+    CURVE_ROWS,
+    MOST_CURVES,
+    MOTOR_NAMES,
+    MOTOR_STATE,
+    N_NOMINAL,
+    NOMINAL_STATE,
+    SIGNALS,
+    UNISON_NAMES,
+)
 from vaneloop.base.vanes import MOST
 
 __all__ = [
     "CURVES", "DERIVED", "EFFECTS", "MOTOR", "MOTOR_AT", "NEUTRAL", "N_PARAMETERS", "N_STATE", "ROW", "SIGNAL_AT",
-    "STATE", "STATE_ROW", "rows_at", "states_of",
+    "STATE", "STATE_ROW", "UNISON", "rows_at", "states_of",
 ]  # fmt: skip
 
 
@@ -45,7 +54,8 @@ for _name, _effect in EFFECTS.items():
 
 DERIVED = _row  # rows worked out from the effects' parameters by `plant.parameters.derive`, see there
 MOTOR = DERIVED + 5 + MOST  # rows of an electromechanical actuator: its kind, `MOTOR_NAMES`, two derived ones
-CURVES = MOTOR + 1 + len(MOTOR_NAMES) + 2  # rows of curves that were learned: their number, and each (`plant.layout`)
+UNISON = MOTOR + 1 + len(MOTOR_NAMES) + 2  # rows of two actuators: how many, `UNISON_NAMES`
+CURVES = UNISON + 1 + len(UNISON_NAMES)  # rows of curves that were learned: their number, and each (`plant.layout`)
 N_PARAMETERS = CURVES + 1 + MOST_CURVES * CURVE_ROWS
 MOTOR_AT = len(_states)  # first row of `MOTOR_STATE` in s
 SIGNAL_AT = MOTOR_AT + len(MOTOR_STATE)  # first row of `SIGNALS` in s

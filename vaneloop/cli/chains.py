@@ -29,6 +29,8 @@ def chain_of(args: argparse.Namespace, model: Any = None, loop: bool = False) ->
     loop  the command simulates the whole loop, too: compiled first, where it is not
     """
     machine = options.machine_of(args, model)
+    if not loop:
+        machine.plant.of_one_actuator("judging subsystems")
     own_parts = split([x for group in getattr(args, "fit", ()) for x in group], options.parts_to_test(args))[:2]
     log = options.read_log_of(args, require=())
     if loop:

@@ -78,7 +78,8 @@ def _known() -> dict[str, tuple[str, ...]]:
     return {
         "--bus": ("lockstep", "local", "vcan0"), "ecu --profile": profiles, "run --profile": profiles,
         "--strategy": tuple(STRATEGIES), "--effect": tuple(EFFECTS), "--without": tuple(EFFECTS),
-        "--criterion": CRITERIA, "--plant": ("plant_electromechanical.toml",), "--on": ("local", "slurm"),
+        "--criterion": CRITERIA, "--on": ("local", "slurm"),
+        "--plant": ("plant_electromechanical.toml", "plant_two_actuators.toml"),
         "inject scenario": tuple(sorted(f.stem for f in scenarios)), "completion shell": SHELLS,
     }  # fmt: skip
 

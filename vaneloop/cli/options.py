@@ -161,7 +161,8 @@ def add_plant_option(group: Any) -> None:
     group.add_argument(
         "--plant",
         metavar="F.toml",
-        help="plant table of another machine: a file, or plant_electromechanical.toml, which ships (docs/machines.md)",
+        help="plant table of another machine: a file, or plant_electromechanical.toml or plant_two_actuators.toml, "
+        "which ship (docs/machines.md)",
     )
 
 

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 from controller.calibration import CalibrationTable
 from plant import build_plant, chain, places
 from plant.parameters import ElectromechanicalTable, derive, read_plant
+from vaneloop.base.errors import InputError
 from vaneloop.base.tables import read
 from vaneloop.design.servo import Complex, Margins, ServoPlant
 
@@ -143,6 +144,8 @@ class MotorServoPlant(ServoPlant):
 def plant_of_tables(plant: str | Path = "plant.toml") -> ServoPlant:
     """Read a plant table, whatever the kind of its actuator; the current limit comes from ``calibration.toml``."""
     t = read_plant(plant)
+    if t.sides > 1:
+        raise InputError(f"{plant}: actuators.number (={t.sides}) must be 1 for the servo's design (docs/machines.md)")
     common = {
         "stroke": t.actuator.stroke.value * 1e-3,
         "lvdt_lag": t.sensors.lvdt_lag.value * 1e-3,

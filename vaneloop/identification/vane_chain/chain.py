@@ -207,6 +207,10 @@ def _build(
     machine = plant or build_plant()
     tables = calibration or load_calibration()
     same_stages(geometry=machine.vanes, vane_angles=tables.vanes)
+    if machine.sides > 1:
+        raise LogError(
+            f"{log.path}: actuators.number (={machine.sides}) must be 1 for judging subsystems (docs/machines.md)"
+        )
     grid = grid or grid_of(log)
     absent: dict[str, str] = {}
     # subsystems that have the same rows, and the same channels late

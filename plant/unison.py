@@ -1,0 +1,136 @@
+"""Two actuators on the same unison rings: what unequal strokes do to the rings, and the rings to the pistons.
+
+Each actuator, A and B, turns a bell crank of its own, and by a vertical link of its own drives each ring at a point;
+the two points lie opposite each other. Ring k would turn to th_A with A alone, to th_B with B alone (`plant.linkage`,
+at the strokes x_A and x_B). It comes to rest between::
+
+    V   = 1/2 sum_k kappa (th_A,k - th_B,k)^2                    elastic energy (J)
+    F_A =   dV/dx_A =   sum_k kappa th_A,k' (th_A,k - th_B,k)    load on piston A, against extension (N)
+    F_B =   dV/dx_B = - sum_k kappa th_B,k' (th_A,k - th_B,k)    on piston B
+    th(phi) = 1/2 (th_A + th_B) + 1/2 (th_A - th_B) cos phi      what a vane at phi sees
+
+Symbols: kappa stiffness of a ring between its driven points (N m/rad), ' d/dx (rad/m, `plant.linkage.ring_slope`), phi
+angle around the ring from the point that A drives (rad). The piston ahead is pushed back and the other pulled along.
+
+th(phi) is exact for a ring that stays round. It turns by th and shifts sideways by e, held by its rollers and levers;
+a point at phi then moves along the circumference by R th + e cos phi, R radius. At the driven points, phi = 0 and pi,
+this is R th_A and R th_B. So th is their mean and e = R (th_A - th_B) / 2. Rollers and levers of the sideways stiffness
+k (N/m) give kappa = k R^2 / 4. A vane a quarter around, phi = pi/2, sees the mean.
+
+Within a tick the forces are linear in both strokes, about those at its start::
+
+    F = F0 + K (x - x0),   K_AA = sum kappa th_A'^2,   K_AB = - sum kappa th_A' th_B',   K_BB = sum kappa th_B'^2
+
+What is left out is kappa th'' (th_A - th_B + th' dx / 2) dx: with 1 mm between the strokes and 0.15 mm of travel in a
+tick, at full speed, 7e-4 of what the travel adds, and nothing of it stays after the tick. The oil columns of compliance
+C give way under the same forces (x = w - C F, w the stroke without them), so that each step solves
+(1 + K C) F = F0 + K (w - x0): springs in series, stable at any stiffness.
+
+Limits: the ring does not bend and does not tilt out of its plane. One that stretches evenly between its points is
+linear in phi instead: a vane then sees up to 0.11 (th_A - th_B) less. No mass, no damping of its own. Play acts on the
+mean of both points. At equal strokes nothing of this acts.
+Source: kinematics of a rigid body in the plane; virtual work, Lanczos, The Variational Principles of Mechanics (1970),
+ch. III; stiffness of the oil, Merritt (1967), section 6-2.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from plant import stem
+from plant.drive import DriveState
+from plant.effects import oil_compressibility
+from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank, crank_slope, ring_angle, ring_slope
+from plant.parameters import GEOMETRY, POT_POSITION, RING_STIFFNESS, VANE_COUNT
+from plant.places import X
+from vaneloop.base.compiled import in_place, inlined
+
+__all__ = ["Tie", "energy", "forces", "ring_at", "tie", "unjoined"]
+
+
+class Tie(NamedTuple):
+    """What the rings do to both pistons, about the strokes ``x_a``, ``x_b`` (m): loads against extension (N) there, and
+    their slopes (N/m); ``k_ab`` is what a metre of B takes off the load of A, and of A off that of B.
+    """
+
+    x_a: float
+    x_b: float
+    f_a: float
+    f_b: float
+    k_a: float
+    k_b: float
+    k_ab: float
+
+
+@in_place
+def _driven(s: np.ndarray, p: np.ndarray, j: int, side: int, k: int) -> tuple[float, float]:
+    """Return where the actuator in lane ``side`` drives ring ``k`` (rad), and how far a metre of stroke (rad/m)."""
+    g, x, d = GEOMETRY, s[X, side], stem.prepare(p, j, k)
+    lx0, x1, y1, le = p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j]
+    c, e = crank(x, lx0, x1, y1, le)
+    turning = crank_slope(x, lx0, x1, y1, le)
+    theta = ring_angle(c, e, d.ax, d.ay, d.lb, d.lc, d.ld)
+    return theta, ring_slope(turning, c, e, d.ax, d.ay, d.lb, d.lc, d.ld)
+
+
+@in_place
+def tie(s: np.ndarray, p: np.ndarray, j: int) -> Tie:
+    """Return what joins the pistons in lanes ``j`` (A) and ``j`` + 1 (B) at their strokes."""
+    f_a = f_b = k_a = k_b = k_ab = 0.0
+    kappa = p[RING_STIFFNESS, j]
+    for k in range(int(p[VANE_COUNT, j])):
+        theta_a, slope_a = _driven(s, p, j, j, k)
+        theta_b, slope_b = _driven(s, p, j, j + 1, k)
+        torque = kappa * (theta_a - theta_b)
+        f_a += slope_a * torque
+        f_b -= slope_b * torque
+        k_a += kappa * slope_a * slope_a
+        k_b += kappa * slope_b * slope_b
+        k_ab += kappa * slope_a * slope_b
+    return Tie(s[X, j], s[X, j + 1], f_a, f_b, k_a, k_b, k_ab)
+
+
+@inlined
+def unjoined(z: DriveState, d: Any, load: float, dt: float) -> float:
+    """Return the stroke (m) to which a piston in the state ``z`` comes in a step ``dt`` (s) without the rings' force,
+    under the rest of its ``load`` (N).
+    """
+    compliance, drag = d.oil_compressibility_compliance, d.oil_compressibility_drag
+    give = oil_compressibility.step(load, z.speed, compliance, drag, d.nominal)
+    return z.x - z.give + z.speed * dt + give
+
+
+@inlined
+def forces(t: Tie, w_a: float, w_b: float, c_a: float, c_b: float) -> tuple[float, float]:
+    """Return the rings' loads (N, against extension) on pistons that would be at ``w_a``, ``w_b`` (m) without them,
+    with oil of compliance ``c_a``, ``c_b`` (m/N) behind.
+    """
+    d_a, d_b = w_a - t.x_a, w_b - t.x_b
+    r_a = t.f_a + t.k_a * d_a - t.k_ab * d_b
+    r_b = t.f_b + t.k_b * d_b - t.k_ab * d_a
+    m_a, m_b, n_a, n_b = 1.0 + t.k_a * c_a, 1.0 + t.k_b * c_b, t.k_ab * c_a, t.k_ab * c_b
+    per = 1.0 / (m_a * m_b - n_a * n_b)  # of a determinant of 1 or more
+    return (m_b * r_a + n_b * r_b) * per, (m_a * r_b + n_a * r_a) * per
+
+
+@in_place
+def ring_at(s: np.ndarray, p: np.ndarray, j: int, k: int) -> tuple[float, float]:
+    """Return the angle (rad) to which both actuators drive ring ``k``, their mean, and what its potentiometer's place
+    on the ring adds.
+    """
+    theta_a, _ = _driven(s, p, j, j, k)
+    theta_b, _ = _driven(s, p, j, j + 1, k)
+    return 0.5 * (theta_a + theta_b), 0.5 * (theta_a - theta_b) * math.cos(p[POT_POSITION, j])
+
+
+@in_place
+def energy(s: np.ndarray, p: np.ndarray, j: int) -> float:
+    """Return the elastic energy (J) in the rings of lanes ``j`` and ``j`` + 1."""
+    total = 0.0
+    for k in range(int(p[VANE_COUNT, j])):
+        twist = _driven(s, p, j, j, k)[0] - _driven(s, p, j, j + 1, k)[0]
+        total += 0.5 * p[RING_STIFFNESS, j] * twist * twist
+    return total
