@@ -385,7 +385,7 @@ def stem_angle(
     theta = ring_angle(c, d, stage.ax, stage.ay, stage.lb, stage.lc, stage.ld)
     twist = 0.0
     if p[ACTUATORS, j] != 0.0:
-        theta, twist = unison.ring_at(s, p, j, k)
+        theta, twist = unison.ring_at(s, p, j, stage, theta)
     theta, play = stem.drive(stage, theta, n_r, t_oil, t, True), 0.0
     if p[CURVES, j] != 0.0:
         theta += curve.bend(s, p, j, curve.RING_ADDS) + curve.bend(s, p, j, curve.RING_ADDS + 1 + k)

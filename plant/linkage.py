@@ -69,7 +69,7 @@ __all__ = [
     "paper_vane",
     "ring_angle",
     "ring_angle_of_vane",
-    "ring_slope",
+    "ring_motion",
     "ring_tangent",
     "stage_ring_angle",
     "stage_vane_angle",
@@ -224,18 +224,22 @@ def crank_slope(stroke: float, lx0: float, x1: float, y1: float, le: float) -> f
 
 
 @compiled
-def ring_slope(turning: float, c: float, s: float, ax: float, ay: float, lb: float, lc: float, ld: float) -> float:
-    """Slope d th5 / d stroke of the ring, rad/m, of a crank in the direction (c, s) that is ``turning`` by
-    `crank_slope`; 0 where the linkage is held stretched or folded.
+def ring_motion(
+    turning: float, c: float, s: float, ax: float, ay: float, lb: float, lc: float, ld: float
+) -> tuple[float, float]:
+    """Rotation th5 of the ring, rad (`ring_angle`), and its slope d th5 / d stroke, rad/m (`vane_slope`), of a crank in
+    the direction (c, s) that is ``turning`` by `crank_slope`; the slope is 0 where the linkage is held stretched or
+    folded.
     """
     cos5, sin5 = _ring_direction(c, s, ax, ay, lb, lc, ld)
+    theta = math.atan2(sin5, cos5)
     wx, wy = -sin5, cos5
     px = ax + lb * c - ld * wx
     py = ay + lb * s - ld * wy
     turn = py * wx - px * wy
     if abs(turn) < 1e-9 * ld:
-        return 0.0
-    return turning * lb * (py * c - px * s) / (ld * turn)
+        return theta, 0.0
+    return theta, turning * lb * (py * c - px * s) / (ld * turn)
 
 
 @compiled
@@ -267,10 +271,8 @@ def vane_slope(stroke: float, g: np.ndarray, k: int) -> float:
     turning = crank_slope(stroke, g[G_LX0], g[G_X1], g[G_Y1], g[G_LE])
     c, s = crank(stroke, g[G_LX0], g[G_X1], g[G_Y1], g[G_LE])
     ax, ay, lb, lc, ld = g[o + G_AX], g[o + G_AY], g[o + G_LB], g[o + G_LC], g[o + G_LD]
-    dring = ring_slope(turning, c, s, ax, ay, lb, lc, ld)
-    if dring == 0.0:
-        return 0.0
-    return dring * vane_per_ring(ring_angle(c, s, ax, ay, lb, lc, ld), g[o + G_LDP], g[o + G_L])
+    theta, dring = ring_motion(turning, c, s, ax, ay, lb, lc, ld)
+    return 0.0 if dring == 0.0 else dring * vane_per_ring(theta, g[o + G_LDP], g[o + G_L])
 
 
 @compiled

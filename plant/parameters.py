@@ -84,6 +84,7 @@ __all__ = [
     "POT_LAG",
     "POT_POSITION",
     "POT_SHARE",
+    "POT_SHIFT",
     "P_REF",
     "RATED_CURRENT",
     "RATED_SPEED",
@@ -155,6 +156,7 @@ AMPLIFIER_SHARE = VOLTAGE + 2
 # rows of a machine with two actuators
 ACTUATORS = UNISON  # how many: 2, side B's numbers in the next lane; 0: one
 RING_STIFFNESS, POT_POSITION = range(UNISON + 1, UNISON + 1 + len(UNISON_NAMES))  # N m/rad; rad
+POT_SHIFT = POT_POSITION + 1  # -, of the angle between the driven points, what the potentiometers see beyond the mean
 MOTOR_STEP = 2.5e-4  # s, the longest step of a motor; a longer plant step, as the search takes, is divided
 
 _SI = {"mm": 1e-3, "mA": 1e-3, "ms": 1e-3, "MPa": 1e6, "N/um": 1e6, "deg": math.pi / 180.0}
@@ -445,6 +447,7 @@ def derive_lane(p: np.ndarray, j: int, dt: float, tick: float) -> None:
     p[VANE_EFFECTS, j] = changed(p, j, _VANE_ROWS)
     if p[ACTUATORS, j] != 0.0:  # nor have two actuators
         p[DRIVE_EFFECTS, j] = p[DRIVE_LOADED, j] = p[VANE_EFFECTS, j] = 1.0
+        p[POT_SHIFT, j] = 0.5 * math.cos(p[POT_POSITION, j])
     if p[CURVES, j] != 0.0:  # nor have curves
         p[DRIVE_EFFECTS, j] = p[VANE_EFFECTS, j] = 1.0
         if acts(p, j, LOAD_ADDS):

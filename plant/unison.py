@@ -9,7 +9,7 @@ at the strokes x_A and x_B). It comes to rest between::
     F_B =   dV/dx_B = - sum_k kappa th_B,k' (th_A,k - th_B,k)    on piston B
     th(phi) = 1/2 (th_A + th_B) + 1/2 (th_A - th_B) cos phi      what a vane at phi sees
 
-Symbols: kappa stiffness of a ring between its driven points (N m/rad), ' d/dx (rad/m, `plant.linkage.ring_slope`), phi
+Symbols: kappa stiffness of a ring between its driven points (N m/rad), ' d/dx (rad/m, `plant.linkage.ring_motion`), phi
 angle around the ring from the point that A drives (rad). The piston ahead is pushed back and the other pulled along.
 
 th(phi) is exact for a ring that stays round. It turns by th and shifts sideways by e, held by its rollers and levers;
@@ -35,7 +35,6 @@ ch. III; stiffness of the oil, Merritt (1967), section 6-2.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,8 +42,8 @@ import numpy as np
 from plant import stem
 from plant.drive import DriveState
 from plant.effects import oil_compressibility
-from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank, crank_slope, ring_angle, ring_slope
-from plant.parameters import GEOMETRY, POT_POSITION, RING_STIFFNESS, VANE_COUNT
+from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank, crank_slope, ring_angle, ring_motion
+from plant.parameters import GEOMETRY, POT_SHIFT, RING_STIFFNESS, VANE_COUNT
 from plant.places import X
 from vaneloop.base.compiled import in_place, inlined
 
@@ -65,15 +64,18 @@ class Tie(NamedTuple):
     k_ab: float
 
 
-@in_place
-def _driven(s: np.ndarray, p: np.ndarray, j: int, side: int, k: int) -> tuple[float, float]:
-    """Return where the actuator in lane ``side`` drives ring ``k`` (rad), and how far a metre of stroke (rad/m)."""
-    g, x, d = GEOMETRY, s[X, side], stem.prepare(p, j, k)
-    lx0, x1, y1, le = p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j]
-    c, e = crank(x, lx0, x1, y1, le)
-    turning = crank_slope(x, lx0, x1, y1, le)
-    theta = ring_angle(c, e, d.ax, d.ay, d.lb, d.lc, d.ld)
-    return theta, ring_slope(turning, c, e, d.ax, d.ay, d.lb, d.lc, d.ld)
+@inlined
+def _crank(s: np.ndarray, p: np.ndarray, j: int, side: int) -> tuple[float, float]:
+    """Return the direction of the crank that the actuator in lane ``side`` turns."""
+    g = GEOMETRY
+    return crank(s[X, side], p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
+
+
+@inlined
+def _turning(s: np.ndarray, p: np.ndarray, j: int, side: int) -> float:
+    """Return the slope (rad/m) of that crank."""
+    g = GEOMETRY
+    return crank_slope(s[X, side], p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
 
 
 @in_place
@@ -81,9 +83,13 @@ def tie(s: np.ndarray, p: np.ndarray, j: int) -> Tie:
     """Return what joins the pistons in lanes ``j`` (A) and ``j`` + 1 (B) at their strokes."""
     f_a = f_b = k_a = k_b = k_ab = 0.0
     kappa = p[RING_STIFFNESS, j]
+    c_a, e_a = _crank(s, p, j, j)
+    c_b, e_b = _crank(s, p, j, j + 1)
+    turning_a, turning_b = _turning(s, p, j, j), _turning(s, p, j, j + 1)
     for k in range(int(p[VANE_COUNT, j])):
-        theta_a, slope_a = _driven(s, p, j, j, k)
-        theta_b, slope_b = _driven(s, p, j, j + 1, k)
+        d = stem.prepare(p, j, k)
+        theta_a, slope_a = ring_motion(turning_a, c_a, e_a, d.ax, d.ay, d.lb, d.lc, d.ld)
+        theta_b, slope_b = ring_motion(turning_b, c_b, e_b, d.ax, d.ay, d.lb, d.lc, d.ld)
         torque = kappa * (theta_a - theta_b)
         f_a += slope_a * torque
         f_b -= slope_b * torque
@@ -116,21 +122,27 @@ def forces(t: Tie, w_a: float, w_b: float, c_a: float, c_b: float) -> tuple[floa
     return (m_b * r_a + n_b * r_b) * per, (m_a * r_b + n_a * r_a) * per
 
 
-@in_place
-def ring_at(s: np.ndarray, p: np.ndarray, j: int, k: int) -> tuple[float, float]:
-    """Return the angle (rad) to which both actuators drive ring ``k``, their mean, and what its potentiometer's place
-    on the ring adds.
+@inlined
+def ring_at(s: np.ndarray, p: np.ndarray, j: int, d: Any, theta: float) -> tuple[float, float]:
+    """Return the angle (rad) of a ring that actuator A alone would turn to ``theta``, the mean of both, and what its
+    potentiometer's place adds.
+
+    d  of the ring's stage, `plant.stem.prepare`
     """
-    theta_a, _ = _driven(s, p, j, j, k)
-    theta_b, _ = _driven(s, p, j, j + 1, k)
-    return 0.5 * (theta_a + theta_b), 0.5 * (theta_a - theta_b) * math.cos(p[POT_POSITION, j])
+    c, e = _crank(s, p, j, j + 1)
+    other = ring_angle(c, e, d.ax, d.ay, d.lb, d.lc, d.ld)
+    return 0.5 * (theta + other), p[POT_SHIFT, j] * (theta - other)
 
 
 @in_place
 def energy(s: np.ndarray, p: np.ndarray, j: int) -> float:
     """Return the elastic energy (J) in the rings of lanes ``j`` and ``j`` + 1."""
     total = 0.0
+    c_a, e_a = _crank(s, p, j, j)
+    c_b, e_b = _crank(s, p, j, j + 1)
     for k in range(int(p[VANE_COUNT, j])):
-        twist = _driven(s, p, j, j, k)[0] - _driven(s, p, j, j + 1, k)[0]
-        total += 0.5 * p[RING_STIFFNESS, j] * twist * twist
+        d = stem.prepare(p, j, k)
+        theta_a = ring_angle(c_a, e_a, d.ax, d.ay, d.lb, d.lc, d.ld)
+        theta_b = ring_angle(c_b, e_b, d.ax, d.ay, d.lb, d.lc, d.ld)
+        total += 0.5 * p[RING_STIFFNESS, j] * (theta_a - theta_b) ** 2
     return total

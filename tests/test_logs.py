@@ -32,7 +32,7 @@ from hil.logs.signals import cut_signal, e2e_crc, encode, select
 from hil.logs.trc import read_trc
 from tests.conftest import examples
 from vaneloop.base import tables
-from vaneloop.base.signals import UNITS
+from vaneloop.base.signals import SIDES, UNITS
 from vaneloop.base.vanes import VANES
 
 DBC = tables.path("vgv.dbc")
@@ -71,7 +71,7 @@ def run(n: int = 400, seed: int = 1) -> dict[str, Channel]:
     rng = np.random.default_rng(seed)
     t = np.arange(n) * 0.01
     slow = t[::10]
-    out = {name: Channel(t, rng.uniform(5, 40, n)) for name in UNITS if name not in ("p_s", "t_oil", "state")}
+    out = {name: Channel(t, rng.uniform(5, 40, n)) for name in UNITS if name not in ("p_s", "t_oil", "state", *SIDES)}
     out["state"] = Channel(t, rng.integers(0, 5, n).astype(float))
     return out | {
         "p_s": Channel(slow, rng.uniform(5, 25, slow.size)),

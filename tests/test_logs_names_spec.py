@@ -16,7 +16,7 @@ from hil.logs.plausible import RANGES, judge, latest, longest_part, out_of_order
 from hil.logs.source import LogError, Series
 from hil.logs.units import factor_of
 from plant.geometry import load_schedules
-from vaneloop.base.signals import UNITS
+from vaneloop.base.signals import SIDES, UNITS
 from vaneloop.base.vanes import VANES
 
 ALL = tuple(UNITS)
@@ -643,6 +643,7 @@ def test_a_design_speed_has_two_digits_or_three_within_one_per_cent(top: float, 
 
 LIMITS = {
     "n_dem": (-10.0, 150.0), "n_r": (-10.0, 150.0), "x_dem": (-25.0, 75.0), "x_lvdt": (-25.0, 75.0),
+    **dict.fromkeys(SIDES, (-25.0, 75.0)),
     "i_cmd": (-100.0, 100.0), "p_s": (-1.0, 60.0), "t_oil": (-80.0, 200.0), "state": (0.0, 4.0),
     **dict.fromkeys(VANES, (-90.0, 90.0)),
 }  # fmt: skip

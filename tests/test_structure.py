@@ -164,7 +164,7 @@ EXPORTS: dict[str, list[str]] = {
         *("judge", "library", "load_scenario", "run"),
     ],
     "hil.fmu": ["is_made", "write_fmu"],
-    "hil.replay": ["ReplayResult", "replay", "replay_json"],
+    "hil.replay": ["ReplayResult", "apart", "replay", "replay_json"],
     "hil.native": ["Program"],
     "hil.uds": ["Server", "TroubleMemory"],
     "hil.logs": [

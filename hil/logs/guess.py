@@ -19,7 +19,7 @@ from hil.logs import plausible
 from hil.logs.names import Meaning, bracketed, lacks, meaning, spool, unit_kind
 from hil.logs.source import LogError, Source
 from hil.logs.units import NO_UNIT, factor_of, scale_of
-from vaneloop.base.signals import UNITS
+from vaneloop.base.signals import SIDES, UNITS
 from vaneloop.base.vanes import VANES
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def guess(
     taken   names of the log that are a signal already
     stated  signal -> unit, where the user named it
     """
-    signals = tuple(s for s in missing if s in UNITS and s != "state")
+    signals = tuple(s for s in missing if s in UNITS and s not in ("state", *SIDES))
     comments: Mapping[str, str] = getattr(source, "comments", {})
     found: dict[str, list[Guess]] = {}
     out = Guesses()

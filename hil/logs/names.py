@@ -15,6 +15,7 @@ import itertools
 import re
 from dataclasses import dataclass, replace
 
+from vaneloop.base.signals import SIDES
 from vaneloop.base.vanes import VANES
 
 __all__ = [
@@ -369,6 +370,13 @@ def meaning(name: str, signals: tuple[str, ...], unit: str = "") -> Meaning | No
     return whole if whole is not None and (last is None or whole.confidence > last.confidence) else last
 
 
+def _quantity_of(signal: str) -> str:
+    """The quantity of one of our signals."""
+    if signal in _SIGNALS:
+        return _SIGNALS[signal][0]
+    return "stroke" if signal in SIDES else "angle"
+
+
 def _last(name: str, signals: tuple[str, ...], said: str) -> Meaning | None:
     """What the part of a name behind its path says, in the unit that the log states."""
     words, unit, quantity = unit_in_name(name, said)
@@ -378,7 +386,7 @@ def _last(name: str, signals: tuple[str, ...], said: str) -> Meaning | None:
         own = signal.replace("_", "")
         if signal != "state" and plain.startswith(own):
             behind = "" if plain == own else _UNITS.get(plain.removeprefix(own), "no unit")
-            if not behind or behind in _OF[_SIGNALS[signal][0] if signal in _SIGNALS else "angle"]:
+            if not behind or behind in _OF[_quantity_of(signal)]:
                 sure = 0.5 if words == ("nr",) and not behind and not kind else CERTAIN  # Nr counts rows in German
                 return Meaning(signal, behind, sure, f"is called {signal}")
     kinds, unknown, numbers, misspelt = _kinds(words)

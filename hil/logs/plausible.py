@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vaneloop.base.signals import SIDES
 from vaneloop.base.vanes import VANES
 
 __all__ = [
@@ -102,6 +103,7 @@ RANGES = {
     ),
     **dict.fromkeys(VANES, _ANGLE),
     "state": Range("-", 0.0, 4.0, "the modes of vgv.dbc: INIT, STANDBY, RUN, DEGRADED, FAIL_SAFE"),
+    **dict.fromkeys(SIDES, _STROKE),
 }  # fmt: skip
 
 
@@ -143,7 +145,7 @@ def proposed(signal: str, values: np.ndarray) -> str:
 
 
 # what shows that the machine moves, and how much at least: signal -> own unit
-_MOVES = dict.fromkeys(("n_dem", "n_r", "x_dem", "x_lvdt", *VANES), 10.0)
+_MOVES = dict.fromkeys(("n_dem", "n_r", "x_dem", "x_lvdt", *SIDES, *VANES), 10.0)
 _NOTHING = 1e-6  # mA, a nanoampere; no current of a valve is told so finely, and 1 uA if it is in A moves no piston
 _PUSHED = 5.0  # mm of stroke in a second: 1.3 mA at the nominal flow gain
 

@@ -27,6 +27,7 @@ from hil.loop.tick import FRAME, Loop, control, hear, mean_current, move, new_lo
 from plant import Plant, build_plant, chain, places
 from vaneloop.base.compiled import compiled_free, is_cached
 from vaneloop.base.errors import InputError
+from vaneloop.base.signals import SIDES
 from vaneloop.base.vanes import VANES, own_rows
 
 __all__ = ["FRAME", "Run", "Stimulus", "columns_of", "lockstep", "snapshot_names", "to_border", "warm_up"]
@@ -36,7 +37,6 @@ WARM_UP = 1_000  # ticks before t = 0 with the first frame held: the controller 
 _BORDER = {  # columns before those of the vanes -> factor from SI into border units
     "t": 1.0, "n_dem": 1.0, "n_r": 1.0, "x_dem": 1e3, "x_lvdt": 1e3, "i_cmd": 1e3, "p_s": 1e-6, "t_oil": 1.0
 }  # fmt: skip
-_SIDES = ("x_lvdt_a", "x_lvdt_b")  # mm, of a machine with two actuators
 VIGV = len(_BORDER)  # column of the first stage
 
 # columns of a stimulus
@@ -175,12 +175,12 @@ def advance(
 
 def columns_of(vanes: tuple[str, ...], motor: bool = False, two: bool = False) -> tuple[str, ...]:
     """Names of a run's columns, of a machine with these stages, with a motor or without, with two actuators or one."""
-    return (*_BORDER, *vanes, "state", "n_engine", *(("i_motor",) if motor else ()), *(_SIDES if two else ()))
+    return (*_BORDER, *vanes, "state", "n_engine", *(("i_motor",) if motor else ()), *(SIDES if two else ()))
 
 
 def to_border(out: np.ndarray, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Return the columns ``out[:, i]`` (SI) with their ``names`` (`columns_of`) in border units."""
-    factor = {**_BORDER, **dict.fromkeys(VANES, 180.0 / np.pi), **dict.fromkeys(_SIDES, 1e3)}
+    factor = {**_BORDER, **dict.fromkeys(VANES, 180.0 / np.pi), **dict.fromkeys(SIDES, 1e3)}
     return {name: np.ascontiguousarray(out[:, i] * factor.get(name, 1.0)) for i, name in enumerate(names)}
 
 

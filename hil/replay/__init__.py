@@ -21,16 +21,19 @@ from hil.logs.held import ANSWERS, COMMANDS, SAME, answers, held, phase_of_ticks
 from hil.logs.notes import Note, told
 from hil.loop.lockstep import FRAME, Stimulus, lockstep
 from plant import build_plant
-from vaneloop.base.signals import UNITS
+from vaneloop.base.signals import SIDES, UNITS
 from vaneloop.base.vanes import VANES
 
 if TYPE_CHECKING:
     from hil.figures import SignalError
     from hil.logs import Channel, Log
 
-__all__ = ["ReplayResult", "replay", "replay_json"]
+__all__ = ["ReplayResult", "apart", "replay", "replay_json"]
 
-STAGE = {"n_r": "engine", "x_dem": "demand", "i_cmd": "servo", "x_lvdt": "actuator", **dict.fromkeys(VANES, "linkage")}
+STAGE = {
+    "n_r": "engine", "x_dem": "demand", "i_cmd": "servo", **dict.fromkeys(("x_lvdt", *SIDES), "actuator"),
+    **dict.fromkeys(VANES, "linkage"),
+}  # fmt: skip
 DRIVERS = ("n_dem", "n_r", "p_s", "t_oil")  # what the simulated loop takes from the log
 BRIDGED = 0.1  # s, the longest period of the product's own frames that carry a driver
 STATISTICS = ("rms", "mean_abs", "max_abs", "mean_abs_99_100")
@@ -122,11 +125,13 @@ def replay(
             f"n_dem: {int(holes.sum())} gaps longer than {gap:g} s; the last value is held and errors there do not "
             f"count"
         )
+    notes += apart(model)
     in_ticks = answers(channels) is not None
     signals = []
     for name, stage in STAGE.items():
         if name in channels and name not in model:
-            notes.append(f"{name}: this machine has no such vane row (geometry); not compared")
+            why = "has one actuator" if name in SIDES else "has no such vane row (geometry)"
+            notes.append(f"{name}: this machine {why}; not compared")
         elif name in channels:
             c = channels[name]
             if name in COMMANDS and c.framed:  # the plant's engine gets a demand when the controller has it
@@ -162,6 +167,15 @@ def replay(
         log.path, run.simulated_s, run.wall_s, run.state_hash, signals, t + begin, model, target, dict(log.channels),
         notes,
     )  # fmt: skip
+
+
+def apart(columns: Mapping[str, np.ndarray]) -> list[str]:
+    """How far apart the LVDTs of two actuators are in a run, in words; of one actuator nothing."""
+    if not columns.keys() >= {*SIDES}:
+        return []
+    way = columns[SIDES[0]] - columns[SIDES[1]]
+    most = way[np.argmax(np.abs(way))]
+    return [f"{SIDES[0]} - {SIDES[1]}: {way.mean():.3f} mm in the mean, {most:.3f} mm at most"]
 
 
 def _driven(log: Log, notes: list[str]) -> tuple[dict[str, Channel], float]:

@@ -54,8 +54,8 @@ for _name, _effect in EFFECTS.items():
 
 DERIVED = _row  # rows worked out from the effects' parameters by `plant.parameters.derive`, see there
 MOTOR = DERIVED + 5 + MOST  # rows of an electromechanical actuator: its kind, `MOTOR_NAMES`, two derived ones
-UNISON = MOTOR + 1 + len(MOTOR_NAMES) + 2  # rows of two actuators: how many, `UNISON_NAMES`
-CURVES = UNISON + 1 + len(UNISON_NAMES)  # rows of curves that were learned: their number, and each (`plant.layout`)
+UNISON = MOTOR + 1 + len(MOTOR_NAMES) + 2  # rows of two actuators: how many, `UNISON_NAMES`, a derived one
+CURVES = UNISON + 1 + len(UNISON_NAMES) + 1  # rows of curves that were learned: their number, and each (`plant.layout`)
 N_PARAMETERS = CURVES + 1 + MOST_CURVES * CURVE_ROWS
 MOTOR_AT = len(_states)  # first row of `MOTOR_STATE` in s
 SIGNAL_AT = MOTOR_AT + len(MOTOR_STATE)  # first row of `SIGNALS` in s

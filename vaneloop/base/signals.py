@@ -2,11 +2,12 @@
 
 from vaneloop.base.vanes import VANES
 
-__all__ = ["UNITS", "heading"]
+__all__ = ["SIDES", "UNITS", "heading"]
 
+SIDES = ("x_lvdt_a", "x_lvdt_b")  # stroke of each of two actuators; x_lvdt is their mean
 UNITS = {
     "n_dem": "%", "n_r": "%", "x_dem": "mm", "x_lvdt": "mm", "i_cmd": "mA", "p_s": "MPa", "t_oil": "degC",
-    **dict.fromkeys(VANES, "deg"), "state": "-",
+    **dict.fromkeys(VANES, "deg"), "state": "-", **dict.fromkeys(SIDES, "mm"),
 }  # fmt: skip
 
 

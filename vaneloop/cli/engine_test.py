@@ -10,7 +10,7 @@ from typing import Any
 
 from hil.engine_test import engine_test, load_profile
 from hil.loop.lockstep import warm_up
-from hil.replay import STATISTICS, ReplayResult, replay_json
+from hil.replay import STATISTICS, ReplayResult, apart, replay_json
 from plant import build_plant
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
@@ -109,6 +109,9 @@ def command(args: argparse.Namespace) -> int:
         for k in STATISTICS[1:]
         if (v := getattr(vigv, k)) is not None and v > PAPER_TABLE_5[k]
     ]
+    for strategy, r in results.items():
+        for note in apart(r.model):
+            terminal.say(args, f"{strategy}: {note}")
     for line in exceeded:
         terminal.say(args, f"exceeded: {line}")
     out: dict[str, Any] = {

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.logs import Channel, write_log
-from hil.logs.formats import FORMATS, listed
+from hil.logs.formats import FORMATS, format_of, listed
 from hil.logs.notes import told
 from hil.loop.lockstep import warm_up
 from hil.native import Program, crash_log
@@ -18,7 +18,9 @@ from hil.native.crash_log import is_crash_log
 from hil.replay import STAGE, STATISTICS, ReplayResult
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError, meant
+from vaneloop.base.signals import SIDES, UNITS
 from vaneloop.cli import options
+from vaneloop.pages.run import NAMES
 from vaneloop.verbs.replay import replay
 
 __all__ = ["DESCRIPTION", "add_options", "command", "replayed"]
@@ -132,7 +134,9 @@ def replayed(
         words = " ".join(["vaneloop replay", args.log, *(a for a in sys.argv[2:] if a != args.log)])
         terminal.say(args, f"page: {answer.report(args.report, words)}")
     if args.out:
-        channels = {k: Channel(result.t, v) for k, v in result.model.items()}
+        table = format_of(Path(args.out)).channels is not None  # the bus has no motor current, and the mean stroke only
+        own = {k: v for k, v in result.model.items() if table or k in UNITS and k not in SIDES}
+        channels = {k: Channel(result.t, v, unit=NAMES[k][1] or "-") for k, v in own.items()}
         write_log(args.out, channels)
         terminal.say(args, f"simulated run: {args.out}")
     return 1 if exceeded else 0

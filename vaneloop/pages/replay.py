@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.figures import AGREES, SignalError
+from vaneloop.base.signals import SIDES
 from vaneloop.base.vanes import VANES
 from vaneloop.pages.figures import Line, Panel, histogram, overlay
 from vaneloop.pages.page import Page
@@ -84,6 +85,18 @@ def replay_page(result: Result, command: str = "", title: str | None = None, not
     if "i_motor" in result.model:
         page.section("Motor current", "What the actuator's motor takes in the simulated run. It is not on the bus.")
         page.plot(overlay([Panel(axis_title("i_motor"), [Line("model", result.t, result.model["i_motor"])])]))
+    if result.model.keys() >= {*SIDES}:
+        page.section(
+            "Both actuators",
+            "Strokes as the LVDT of each actuator measures them, and how far A is ahead of B. The controller gets "
+            "their mean. Unequal strokes twist the unison rings, and the pistons work against each other.",
+        )
+        strokes = [
+            Line(name, result.t, result.model[side], role)
+            for name, side, role in zip("AB", SIDES, ("model", "other"), strict=True)
+        ]
+        ahead = Line("A − B", result.t, result.model[SIDES[0]] - result.model[SIDES[1]], "error")
+        page.plot(overlay([Panel("stroke [mm]", strokes), Panel("A − B [mm]", [ahead])]))
     vanes = [v for v in VANES if v in result.model]
     if vanes:
         _hysteresis_section(page, result, vanes)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.figures import SignalError, noise_floor
+from vaneloop.base.signals import SIDES
 from vaneloop.base.vanes import VANES
 from vaneloop.pages.figures import Line, loop
 from vaneloop.pages.page import Page
@@ -41,6 +42,7 @@ NAMES = {
     **{v: (f"{v.upper()} angle", "deg") for v in VANES},
     "state": ("controller mode", ""),
     "i_motor": ("motor current", "A"),
+    **{name: (f"stroke of actuator {name[-1].upper()}", "mm") for name in SIDES},
 }
 ZOOM = "Drag across a plot to zoom, double-click to return; click a name in the legend to hide its curve."
 
