@@ -298,8 +298,8 @@ def root(d: Any, p_s: float) -> float:
 
 @inlined
 def half_share(d: Any, p_s: float) -> float:
-    """Return half of what a newton on the piston is of the supply ``p_s`` (Pa), 1/N."""
-    return 0.5 * d.per_area / p_s
+    """Return half of what a newton on the piston is of the supply ``p_s`` (Pa), 1/N; finite where that is gone."""
+    return 0.5 * d.per_area / max(p_s, 1.0)
 
 
 @inlined

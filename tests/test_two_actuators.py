@@ -24,8 +24,9 @@ from hil.logs import read_log
 from hil.loop.engines import lockstep_engines
 from hil.loop.lanes import lockstep_lanes
 from hil.loop.lockstep import Run, Stimulus, lockstep, snapshot_names
+from hil.replay import replay
 from plant import Model, Plant, build_plant, chain, load_model, unison, write_model
-from plant.effects import oil_compressibility
+from plant.effects import ROW, oil_compressibility
 from plant.linkage import stage_vane_angle
 from plant.model import Side
 from plant.parameters import AREA, PLAY, POT_POSITION, RING_STIFFNESS, derive
@@ -35,6 +36,7 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path, read
 from vaneloop.cli.main import COMMANDS, main
 from vaneloop.design.servo_motor import plant_of_tables
+from vaneloop.fleet.plan import model_of
 from vaneloop.identification.vane_chain.chain import build_chain
 from vaneloop.verbs.machine import Machine
 
@@ -441,3 +443,50 @@ def test_the_library_refuses_what_the_commands_refuse(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=r"actuators\.number \(=2\) must be 1 "):
             refused()
+
+
+def test_replay_says_how_far_apart_the_strokes_are_draws_them_and_keeps_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_model(tmp_path / "m.toml", Model(side_b=Side(effects={"lvdt_bias": {"bias": 0.5}})))
+    words = ["--plant", TABLE, "--model", str(tmp_path / "m.toml"), "--report", str(tmp_path / "r.html")]
+    for name, kept in (("x.csv", True), ("x.log", False)):
+        assert main(["replay", LOG, *words, "--out", str(tmp_path / name)]) == 0
+        assert "x_lvdt_a - x_lvdt_b: -0.500 mm in the mean" in capsys.readouterr().out
+        log = read_log(tmp_path / name)
+        assert ({"x_lvdt_a", "x_lvdt_b"} <= log.channels.keys()) == kept
+    assert "how far A is ahead of B" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    log = read_log(tmp_path / "x.csv")
+    assert np.mean(log["x_lvdt_a"].values - log["x_lvdt_b"].values) == pytest.approx(-0.5, abs=1e-3)
+    found = replay(log, plant=TWO)
+    assert {"x_lvdt_a", "x_lvdt_b"} <= {s.signal for s in found.signals}
+    assert "x_lvdt_b: this machine has one actuator; not compared" in replay(log, plant=ONE).notes
+
+
+def test_the_engine_test_says_how_far_apart_the_strokes_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def numbers(value: float, unit: str) -> str:
+        return f'{{ values = [{value}, {value}], unit = "{unit}", origin = "chosen: for a test" }}'
+
+    profile = tmp_path / "short.toml"
+    profile.write_text(
+        'start = { value = 70, unit = "%", origin = "chosen: for a test" }\n'
+        f"speed = {numbers(75, '%')}\nrate = {numbers(5, '%/s')}\ndwell = {numbers(2, 's')}\n"
+    )
+    assert main(["engine-test", "--plant", TABLE, "--profile", str(profile)]) in (0, 1)
+    assert "dual: x_lvdt_a - x_lvdt_b: " in capsys.readouterr().out
+
+
+def test_a_campaigns_machine_keeps_what_one_side_has() -> None:
+    base = Model(side_b=Side(effects={"lvdt_bias": {"bias": 0.5}}))
+    made = model_of([], [], base)
+    assert made.sides == base.sides and made.plant(TWO).p[ROW["lvdt_bias"]].tolist() == [0.0, 5e-4]
+
+
+@pytest.mark.parametrize("plant", [TWO, Model(effects={"internal_leakage": {"coefficient": 1.0}}).plant(ONE)])
+def test_a_machine_stands_while_its_supply_is_gone_and_goes_on_after_that(plant: Plant) -> None:
+    p_s = np.full(len(DEMAND), P_S)
+    p_s[200:400] = 0.0
+    done = lockstep(Stimulus.of(DEMAND, p_s=p_s), plant=plant, hashed=False)
+    stroke = done.columns["x_lvdt"]
+    assert np.ptp(stroke[210:400]) < 0.01 < abs(stroke[600] - stroke[400])
+    assert stroke[-1] == pytest.approx(run(plant).columns["x_lvdt"][-1], abs=0.05)

@@ -262,7 +262,7 @@ def model_of(quantities: list[Varied], values: list[float], base: Model | None =
             effects.setdefault(effect, {})[key] = float(v)
         else:
             parameters[q.name] = float(v)
-    return Model(parameters=parameters, effects=effects, meta=made.meta)
+    return made.model_copy(update={"parameters": parameters, "effects": effects})
 
 
 def base_model(files: dict[str, str], plant: Plant) -> Model | None:

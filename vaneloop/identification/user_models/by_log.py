@@ -286,6 +286,8 @@ def load_model_of(path: str | Path, system: System) -> Model:
     if model.meta.get("system") != system.name:
         whose = model.meta.get("system", "the vane chain")
         raise StageError(f"{path}: is a model of {whose!r}; system {system.name!r} is asked for")
+    if side := next(iter(model.sides), ""):
+        raise StageError(f"{path}: {side} is of a vane chain with two actuators, not of system {system.name!r}")
     return model
 
 
