@@ -48,6 +48,7 @@ from plant.parameters import (
     FLOW_GAIN,
     GEOMETRY,
     KIND,
+    LINE_CONDUCTANCE,
     LVDT_FACTOR,
     LVDT_STEP,
     P_REF,
@@ -216,7 +217,7 @@ def _joined_step(
     s: np.ndarray, p: np.ndarray, j: int, i_cmd: float, n_r: float, p_s: float, t_oil: float, dt: float, substeps: int
 ) -> None:
     """`drive_step` of two actuators, A in lane ``j`` and B in the next, on the same rings (`plant.unison`). Both valves
-    get the current; each piston has half of the air's load.
+    get the current, or the one that both lanes have; each piston has half of the air's load.
     """
     d_a, d_b, z_a, z_b = drive.prepare(p, j), drive.prepare(p, j + 1), drive.taken(s, j), drive.taken(s, j + 1)
     y_a, i_a = drive.current(drive.remembered(s, j), d_a, i_cmd, True)
@@ -225,12 +226,15 @@ def _joined_step(
     feed_a = drive.feed(d_a, drive.flow_gain(d_a, t_oil), load, p_s)
     feed_b = drive.feed(d_b, drive.flow_gain(d_b, t_oil), load, p_s)
     c_a, c_b = 1.0 / d_a.stiffness, 1.0 / d_b.stiffness
-    tie, h = unison.tie(s, p, j), dt / substeps
+    tie, h, line = unison.tie(s, p, j), dt / substeps, p[LINE_CONDUCTANCE, j]
+    one_valve = line != 0.0
     for _ in range(substeps):
         w_a, w_b = unison.unjoined(z_a, d_a, load, h), unison.unjoined(z_b, d_b, load, h)
         f_a, f_b = unison.forces(tie, w_a, w_b, c_a, c_b)
-        z_a = drive.step(z_a, d_a, drive.loaded_by(feed_a, f_a), i_a, p_s, h, True, True, True, True)
-        z_b = drive.step(z_b, d_b, drive.loaded_by(feed_b, f_b), i_b, p_s, h, True, True, True, True)
+        now_a, now_b = drive.loaded_by(feed_a, f_a), drive.loaded_by(feed_b, f_b)
+        port = 0.5 * (drive.pressure(z_a, d_a, now_a) + drive.pressure(z_b, d_b, now_b))
+        z_a = drive.step(z_a, d_a, now_a, i_a, p_s, h, True, True, True, True, 0.0, one_valve, port, line)
+        z_b = drive.step(z_b, d_b, now_b, i_b, p_s, h, True, True, True, True, 0.0, one_valve, port, line)
     drive.stored(s, j, z_a)
     drive.stored(s, j + 1, z_b)
     drive.told(s, j, y_a)

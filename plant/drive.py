@@ -78,6 +78,7 @@ __all__ = [
     "loaded_by",
     "nominal_compliance",
     "prepare",
+    "pressure",
     "remembered",
     "rest",
     "root",
@@ -316,6 +317,12 @@ def loaded_by(f: Feed, force: float) -> Feed:
 
 
 @inlined
+def pressure(z: DriveState, d: Any, f: Feed) -> float:
+    """Return the load pressure (Pa) of a piston, against extension."""
+    return (f.load + z.force) * d.per_area
+
+
+@inlined
 def step(
     z: DriveState,
     d: Any,
@@ -328,6 +335,9 @@ def step(
     sticky: bool,
     limited: bool,
     shut: float = 0.0,
+    lined: bool = False,
+    port: float = 0.0,
+    line: float = 0.0,
 ) -> DriveState:
     """One plant step ``dt`` (s) under the valve's current ``i`` (A) at the supply pressure ``p_s`` (Pa).
 
@@ -335,6 +345,8 @@ def step(
     lossy   False leaves out droop, leakage and round saturation, sticky: stiction, which take long: for lanes where
             these are neutral
     limited False leaves out the valve's lag, the LVDT's second one and the flow's limit, likewise
+    lined   the valve feeds another piston, too: its ports have the load pressure ``port`` (Pa), and a line of the
+            conductance ``line`` (m/s/Pa) leads to this one (`plant.unison`)
     """
     lagged = valve_lag.step(z.lagged, i, d.valve_share) if limited else i
     spool, spool_rate = valve_step(z.spool, z.spool_rate, lagged / d.rated, d.a11, d.a12, d.a21, d.a22)
@@ -342,12 +354,15 @@ def step(
     gain = f.extending if opening > 0.0 else f.retracting
     force, off_centre, give = z.force, z.off_centre, z.give
     if loaded:
-        p_load = (f.load + z.force) * d.per_area
-        against = p_load if opening > 0.0 else -p_load
+        p_load = pressure(z, d, f)
+        felt = port if lined else p_load
+        against = felt if opening > 0.0 else -felt
         speed = opening * (gain * math.sqrt(max(0.0, (p_s - against) * d.per_p_ref)))
         if lossy:
             speed = supply_pressure_droop.step(speed, p_s - against, d.supply_pressure_droop)
             speed = valve_flow_saturation.step(speed, d.valve_flow_saturation_limit, d.valve_flow_saturation_roundness)
+            if lined:
+                speed += line * (port - p_load)
             speed = internal_leakage.step(speed, p_load, d.oil_compressibility_drag * d.per_area, d.internal_leakage)
         elif limited:
             speed = valve_flow_saturation.corner(speed, d.valve_flow_saturation_limit)

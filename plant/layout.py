@@ -169,4 +169,5 @@ MOTOR_STATE = (
 UNISON_NAMES = (
     "actuators.ring_stiffness",  # N m/rad
     "actuators.pot_position",  # rad around the ring from where actuator A drives it
+    "actuators.line_conductance",  # m/s/Pa, from the one valve to either piston; 0: a valve each
 )

@@ -45,7 +45,7 @@ from plant.effects import EFFECTS
 from plant.geometry import Stage
 from plant.layout import MOST_CURVES, PLAY
 from plant.machine import Plant, build_plant
-from plant.parameters import Nominal, derive
+from plant.parameters import LINE_CONDUCTANCE, Nominal, derive
 from vaneloop.base.curve import DEGREE, FINE_SIDE, POINTS, SIDE, splines
 from vaneloop.base.durations import named_lag, period_of
 from vaneloop.base.errors import InputError
@@ -264,11 +264,14 @@ class Model(Table):
         for name, side in self.sides.items():
             if plant.sides != 2:
                 raise InputError(f"{source}: {name}: this machine has one actuator")
+            one_valve = bool(plant.p[LINE_CONDUCTANCE, 0] != 0.0)
             for key in (*side.parameters, *side.effects):
-                if not _of_a_side(key):
+                if not _of_a_side(key, one_valve):
+                    allowed = "actuator and LVDT" if one_valve else "valve, actuator and LVDT"
+                    but = "aero_load, flow gain and area" if one_valve else "aero_load"
                     raise InputError(
-                        f"{source}: {name}: {key!r} is not of one side; allowed: parameters and effects of valve, "
-                        f"actuator and LVDT, but for aero_load"
+                        f"{source}: {name}: {key!r} is not of one side; allowed: parameters and effects of {allowed}, "
+                        f"but for {but}"
                     )
             self._check_part(plant, f"{source}: {name}: ", side)
 
@@ -375,11 +378,14 @@ class Model(Table):
                 p[row] = values.get(parameter.name, parameter.neutral) * parameter.si
 
 
-def _of_a_side(name: str) -> bool:
-    """Whether a parameter or an effect can be that of one of two actuators."""
+def _of_a_side(name: str, one_valve: bool) -> bool:
+    """Whether a parameter or an effect can be that of one of two actuators, with a valve each or with one."""
+    own = ("actuator", "lvdt") if one_valve else ("valve", "actuator", "lvdt")
     if name in EFFECTS:
-        return EFFECTS[name].site in ("valve", "actuator", "lvdt") and name != "aero_load"
-    return name.startswith(("valve.", "actuator.")) or name == "sensors.lvdt_lag" or "." not in name
+        return EFFECTS[name].site in own and name != "aero_load"
+    if one_valve and name in ("actuator.flow_gain", "actuator.area"):
+        return False
+    return name.split(".")[0] in own or name == "sensors.lvdt_lag" or "." not in name
 
 
 def put_curve(p: np.ndarray, curve: Learned, values: Mapping[str, float]) -> None:

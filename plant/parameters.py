@@ -69,6 +69,7 @@ __all__ = [
     "GEOMETRY",
     "KIND",
     "LAG",
+    "LINE_CONDUCTANCE",
     "LVDT_FACTOR",
     "LVDT_LAG",
     "LVDT_SHARE",
@@ -155,11 +156,13 @@ CURRENT_SHARE = VOLTAGE + 1  # share of the way that current loop and amplifier_
 AMPLIFIER_SHARE = VOLTAGE + 2
 # rows of a machine with two actuators
 ACTUATORS = UNISON  # how many: 2, side B's numbers in the next lane; 0: one
-RING_STIFFNESS, POT_POSITION = range(UNISON + 1, UNISON + 1 + len(UNISON_NAMES))  # N m/rad; rad
-POT_SHIFT = POT_POSITION + 1  # -, of the angle between the driven points, what the potentiometers see beyond the mean
+RING_STIFFNESS, POT_POSITION, LINE_CONDUCTANCE = range(UNISON + 1, UNISON + 1 + len(UNISON_NAMES))
+POT_SHIFT = (
+    LINE_CONDUCTANCE + 1
+)  # -, of the angle between the driven points, what the potentiometers see beyond the mean
 MOTOR_STEP = 2.5e-4  # s, the longest step of a motor; a longer plant step, as the search takes, is divided
 
-_SI = {"mm": 1e-3, "mA": 1e-3, "ms": 1e-3, "MPa": 1e6, "N/um": 1e6, "deg": math.pi / 180.0}
+_SI = {"mm": 1e-3, "mA": 1e-3, "ms": 1e-3, "MPa": 1e6, "N/um": 1e6, "deg": math.pi / 180.0, "mm/s/MPa": 1e-9}
 
 
 class Engine(Bounded):
@@ -219,14 +222,15 @@ class SideB(Bounded):
 class Actuators(Bounded):
     """How many actuators drive the vanes, and what joins two (`plant.unison`).
 
-    feed  what feeds them: "a valve each", both under the same current
+    feed  what feeds them: "a valve each", both under the same current, or "one valve" through lines of a conductance
     b     what differs at side B
     """
 
     number: Annotated[Quantity, Bound("-", 1.0, 2.0)]
-    feed: Literal["a valve each"] = "a valve each"
+    feed: Literal["a valve each", "one valve"] = "a valve each"
     ring_stiffness: Annotated[Quantity | None, Bound("N m/rad", 0.0, 1e7)] = None
     pot_position: Annotated[Quantity | None, Bound("deg", 0.0, 360.0)] = None
+    line_conductance: Annotated[Quantity | None, Bound("mm/s/MPa", 0.1, 80.0)] = None
     b: SideB = SideB()
 
     @model_validator(mode="after")
@@ -235,10 +239,16 @@ class Actuators(Bounded):
             raise ValueError(f"number (={self.number.value:g}) must be 1 or 2")
         if self.number.value == 2.0 and (key := next((k for k in _JOINED if getattr(self, k) is None), None)):
             raise ValueError(f"key {key!r} is missing; two actuators need {', '.join(_JOINED)}")
+        one_valve = self.feed == "one valve"
+        if one_valve != (self.line_conductance is not None):
+            raise ValueError(f"line_conductance must be there with feed 'one valve' and only then (={self.feed!r})")
+        if one_valve and (key := next((k for k in _OF_VALVE if getattr(self.b, k) is not None), None)):
+            raise ValueError(f"b.{key} is of a valve of B's own; feed is 'one valve'")
         return self
 
 
-_JOINED = tuple(name.split(".")[1] for name in UNISON_NAMES)
+_JOINED = ("ring_stiffness", "pot_position")
+_OF_VALVE = ("bandwidth", "damping", "flow_gain")
 _OF_B = {"bandwidth": BANDWIDTH, "damping": DAMPING, "flow_gain": FLOW_GAIN, "lvdt_lag": LVDT_LAG}  # rows of p
 
 
@@ -386,8 +396,9 @@ def nominal(table: AnyPlantTable, geometry: Geometry) -> list[Nominal]:
     """
     out = []
     rows = names_of(table.actuator.kind, geometry.vanes)
-    if table.sides == 2:
-        rows |= {name: UNISON + 1 + i for i, name in enumerate(UNISON_NAMES)}
+    if isinstance(table, PlantTable) and table.sides == 2:
+        given = {name: UNISON + 1 + i for i, name in enumerate(UNISON_NAMES)}
+        rows |= {name: row for name, row in given.items() if getattr(table.actuators, name.split(".")[1]) is not None}
     for name, row in rows.items():
         section, key = name.split(".")
         if section == "linkage":

@@ -26,9 +26,19 @@ tick, at full speed, 7e-4 of what the travel adds, and nothing of it stays after
 C give way under the same forces (x = w - C F, w the stroke without them), so that each step solves
 (1 + K C) F = F0 + K (w - x0): springs in series, stable at any stiffness.
 
+With a valve each, the oil of each piston is its own. With one valve, both hang on its ports by lines, and the piston
+with less pressure takes more of the flow::
+
+    v_i = u g sqrt(max(0, (p_s - sign(u) p) / p_ref)) + G (p - p_i),   p = 1/2 (p_A + p_B)
+
+Symbols: v_i speed of piston i (m/s), u spool, g flow gain (m/s), p_i = F_i / A load pressure (Pa), p that at the ports,
+G conductance of the lines to one piston, as speed per pressure (m/s/Pa); what they take at equal pressures is in the
+flow gain. G is bounded so that the step of 0.1 ms is stable with rings of any stiffness: G h < A C.
+
 Limits: the ring does not bend and does not tilt out of its plane. One that stretches evenly between its points is
 linear in phi instead: a vane then sees up to 0.11 (th_A - th_B) less. No mass, no damping of its own. Play acts on the
-mean of both points. At equal strokes nothing of this acts.
+mean of both points. At equal strokes nothing of this acts. While one piston stands at its stop, the other does not get
+its oil.
 Source: kinematics of a rigid body in the plane; virtual work, Lanczos, The Variational Principles of Mechanics (1970),
 ch. III; stiffness of the oil, Merritt (1967), section 6-2.
 """

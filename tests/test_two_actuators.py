@@ -29,7 +29,7 @@ from plant import Model, Plant, build_plant, chain, load_model, unison, write_mo
 from plant.effects import ROW, oil_compressibility
 from plant.linkage import stage_vane_angle
 from plant.model import Side
-from plant.parameters import AREA, PLAY, POT_POSITION, RING_STIFFNESS, derive
+from plant.parameters import AREA, LINE_CONDUCTANCE, PLAY, POT_POSITION, RING_STIFFNESS, derive
 from plant.places import GIVE, POT, READING, RING, X_LVDT, X
 from tests.test_tables import document
 from vaneloop.base.errors import InputError
@@ -490,3 +490,82 @@ def test_a_machine_stands_while_its_supply_is_gone_and_goes_on_after_that(plant:
     stroke = done.columns["x_lvdt"]
     assert np.ptp(stroke[210:400]) < 0.01 < abs(stroke[600] - stroke[400])
     assert stroke[-1] == pytest.approx(run(plant).columns["x_lvdt"][-1], abs=0.05)
+
+
+# ---- one valve -------------------------------------------------------------------------------------------------------
+
+
+def on_one_valve(line: float = 60.0, kappa: float = KAPPA, model: Model | None = None) -> Plant:
+    """The machine with one valve and lines of this conductance (mm/s/MPa)."""
+    plant = with_rings(kappa, model=model)
+    plant.p[LINE_CONDUCTANCE] = line * 1e-9
+    return plant
+
+
+@pytest.mark.parametrize("line", [0.5, 10.0])
+def test_the_shut_valve_lets_unequal_strokes_come_together_through_the_lines(line: float) -> None:
+    """v_A - v_B = G (p_B - p_A), and the mean stays: the difference decays with (1 + 2 C K) A / (2 G K)."""
+    plant = on_one_valve(line)
+    x = drive(plant, at(plant, 24.5e-3, 23.5e-3), 0.2)
+    between, k = x[:, 0] - x[:, 1], stiffness(plant, 24e-3)
+    time = (1.0 + 2.0 * C * k) * A / (2.0 * line * 1e-9 * k)
+    first, last = (9, 19) if line > 1.0 else (49, 149)
+    assert -(last - first) * 1e-3 / math.log(between[last] / between[first]) == pytest.approx(time, rel=1e-2)
+    assert np.allclose(x.sum(axis=1), 48e-3, rtol=0.0, atol=2e-6)
+
+
+@pytest.mark.parametrize("line", [20.0, 80.0])
+def test_more_friction_at_b_leaves_it_behind_by_what_the_rings_make_up_for(line: float) -> None:
+    """In steady motion both have the same pressure: F + f_A = -F + f_B, so F = f_B / 2."""
+    friction = 2000.0
+    plant = on_one_valve(line, model=Model(side_b=Side(effects={"piston_friction": {"force": friction}})))
+    s = plant.start(4e-3, 70.0)
+    drive(plant, s, 2.0, 2e-3)
+    assert s[X, 0] < 0.04
+    assert (s[X, 0] - s[X, 1]) * stiffness(plant, s[X, 0]) == pytest.approx(friction / 2.0, rel=2e-2)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(0.1, 80.0), st.floats(0.0, 1e7), st.floats(0.0, 50.0))
+def test_no_line_and_no_stiffness_lets_a_stroke_run_away(line: float, kappa: float, leak: float) -> None:
+    model = Model(side_b=Side(effects={"internal_leakage": {"coefficient": leak}, "lvdt_bias": {"bias": 1.0}}))
+    done = run(on_one_valve(line, kappa, model), DEMAND[:600])
+    for name, off in (("x_lvdt_a", 0.0), ("x_lvdt_b", 1.0)):
+        assert ((done.columns[name] > off - 0.01) & (done.columns[name] < off + 48.01)).all()
+
+
+def test_equal_actuators_on_one_valve_are_as_those_on_two() -> None:
+    two, one = run(TWO), run(on_one_valve())
+    for name, values in two.columns.items():
+        assert np.allclose(one.columns[name], values, rtol=0.0, atol=1e-9), name
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"feed": "one valve"}, "line_conductance must be there with feed 'one valve' and only then (='one valve')"),
+        ({"line_conductance": quantity(5, "mm/s/MPa")}, "only then (='a valve each')"),
+        ({"feed": "one valve", "line_conductance": quantity(81, "mm/s/MPa")}, "(=81 mm/s/MPa) must be in [0.1, 80]"),
+        (
+            {"feed": "one valve", "line_conductance": quantity(60, "mm/s/MPa"), "b": {"bandwidth": quantity(50, "Hz")}},
+            "b.bandwidth is of a valve of B's own; feed is 'one valve'",
+        ),
+    ],
+)
+def test_a_wrong_feed_is_refused_in_one_line(tmp_path: Path, changed: dict[str, object], said: str) -> None:
+    with pytest.raises(InputError) as e:
+        build_plant(table(tmp_path, **changed))
+    assert said in str(e.value) and "\n" not in str(e.value)
+
+
+def test_one_valve_comes_from_the_table_and_has_no_side(tmp_path: Path) -> None:
+    plant = build_plant(table(tmp_path, feed="one valve", line_conductance=quantity(60, "mm/s/MPa")))
+    assert plant.p[LINE_CONDUCTANCE].tolist() == [pytest.approx(6e-8)] * 2
+    assert "actuators.line_conductance" in {n.name for n in plant.nominal}
+    assert "actuators.line_conductance" not in {n.name for n in TWO.nominal}
+    for side in (Side(effects={"valve_null_bias": {"bias": 1.0}}), Side(parameters={"actuator.flow_gain": 0.149})):
+        with pytest.raises(
+            InputError, match="is not of one side; allowed: parameters and effects of actuator and LVDT"
+        ):
+            Model(side_b=side).check(plant)
+    Model(side_b=Side(effects={"lvdt_bias": {"bias": 1.0}})).check(plant)
