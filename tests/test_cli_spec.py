@@ -490,7 +490,7 @@ def test_the_engine_test_is_held_against_the_paper(
     def result(by: float) -> Any:
         figures = {k: PAPER_TABLE_5.get(k, 0.1) * by for k in STATISTICS}
         return SimpleNamespace(
-            signals=[SimpleNamespace(signal="vigv", samples=9, **figures)], simulated_s=3164.0, wall_s=2.0
+            signals=[SimpleNamespace(signal="vigv", samples=9, **figures)], simulated_s=3164.0, wall_s=2.0, model={}
         )
 
     monkeypatch.setattr(engine, "warm_up", lambda tell: None)
