@@ -641,10 +641,22 @@ def test_an_answer_none_is_unknown_where_a_condition_fails() -> None:
     stage.regimes, stage.regime_units = {"load": rng.permutation(8)[load.astype(int)].astype(float)}, {"load": "kN"}
     judge = LeastSquaresProblem(stage, FLOOR[:1])
     d = said((), "none", final=judge.fit((), stage.neutral()))
-    again = workflow._under_every_condition(stage, d)
+    again = workflow._as_located(stage, d)
     assert again.verdict == "unknown" and again.refused[0].startswith("fails at y: ") and "load" in again.refused[0]
     stage.measured = FLOOR[0] * np.sign(error)[None]
-    assert workflow._under_every_condition(stage, d) is d
+    assert workflow._as_located(stage, d) is d
+
+
+@pytest.mark.parametrize(("size", "verdict"), [(1.07, "none"), (1.13, "unknown")])
+def test_an_answer_unknown_is_none_where_the_stage_fits_everywhere(size: float, verdict: str) -> None:
+    error = size * np.sign(np.random.default_rng(4).standard_normal(30_000))
+    stage = stage_on(DT * np.arange(30_000), np.zeros((1, 1, 30_000)), FLOOR[0] * error[None], (), ("y",))
+    stage.floor = FLOOR[:1]
+    final = LeastSquaresProblem(stage, FLOOR[:1]).fit((), stage.neutral())
+    assert workflow._as_located(stage, said((), "unknown", final=final)).verdict == verdict
+    refused = said((), "unknown", final=final)
+    refused.refused = ["a explains 20% of what exceeds the noise"]
+    assert workflow._as_located(stage, refused) is refused
 
 
 @pytest.mark.parametrize(

@@ -93,17 +93,21 @@ def _one(work: _Work, i: int, tell: Callable[[], None] | None = None) -> tuple[S
             tell()
 
     d = as_compared(stage, diagnose_stage(stage, floor_of(stage), tick=tick, judged=work.judged))
-    if d.verdict == "none" and d.criterion == "noise_floor":
-        d = _under_every_condition(stage, d)
+    if d.criterion == "noise_floor" and not d.final.effects:
+        d = _as_located(stage, d)
     return d, shape(LeastSquaresProblem(stage, d.floor), d.final) if _leaves(d) else []
 
 
-def _under_every_condition(stage: Stage, d: StageDiagnosis) -> StageDiagnosis:
-    """The answer "none", or "unknown" where `locate` finds a condition under which the stage fails: over the whole log
-    little is above the noise, in one place it is.
+def _as_located(stage: Stage, d: StageDiagnosis) -> StageDiagnosis:
+    """The answer without an effect as `locate` has it: "unknown" where the stage fails over the whole log or under a
+    condition, "none" where it fits everywhere, though little would have been enough for a search.
     """
-    hot = locate(LeastSquaresProblem(stage, d.floor), d.final).hot
-    return replace(d, verdict="unknown", refused=[f"fails at {hot[0].worst()}"]) if hot else d
+    located = locate(LeastSquaresProblem(stage, d.floor), d.final)
+    if d.verdict == "none" and located.hot:
+        return replace(d, verdict="unknown", refused=[f"fails at {located.hot[0].worst()}"])
+    if d.verdict == "unknown" and not d.refused and not located.fails:
+        return replace(d, verdict="none", nearest=[])
+    return d
 
 
 def as_compared(stage: Stage, d: StageDiagnosis) -> StageDiagnosis:

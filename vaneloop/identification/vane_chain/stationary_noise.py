@@ -75,7 +75,7 @@ def expect_stationary_noise(stages: Sequence[Stage]) -> list[str]:
             found = [_noise_in(judge, k, e[k], made[k], columns[o]) for k, o in enumerate(stage.outputs)]
             if any(one is None for one in found):
                 continue
-            notes.append(_said(stage, [one for one in found if one is not None]))
+            notes.append(_said(stage, [one for one in found if one is not None], judge.floor))
             _expect(stage, [one for one in found if one is not None], draws)
         for k, channel in enumerate(stage.outputs):
             noise[channel] = _windows(stage, np.where(judge.valid[k], e[k], np.nan), stage.window)
@@ -201,11 +201,11 @@ def _expect(stage: Stage, noise: Sequence[Expected], draws: Array | None) -> Non
     stage.floor = noise_of(stage, stage.neutral())
 
 
-def _said(stage: Stage, noise: Sequence[Expected]) -> str:
-    ratios = np.array([one.size for one in noise]) / np.asarray(stage.floor)
+def _said(stage: Stage, noise: Sequence[Expected], floor: Array) -> str:
+    """What is to be said of a stage that expects more than its ``floor``."""
     named = ", ".join(
-        f"{name} {one.size:.3g} {unit} ({ratio:.3g} times)"
-        for name, unit, one, ratio in zip(stage.outputs, stage.units, noise, ratios, strict=True)
-        if ratio > 1.0
+        f"{name} {one.size:.3g} {unit} ({one.size / seen:.3g} times)"
+        for name, unit, one, seen in zip(stage.outputs, stage.units, noise, floor, strict=True)
+        if one.size > seen
     )
     return f"{stage.name}: noise beyond what changes from row to row, the same under every condition: {named}"
