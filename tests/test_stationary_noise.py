@@ -86,6 +86,9 @@ def test_an_error_that_its_output_does_not_show_where_it_is_quiet_is_no_noise_of
     error = white + 3.0 * coloured(5)
     assert said(error, window=1.0) is not None
     assert said(error, window=1.0, own=white) is None
+    assert said(error, window=1.0, own=white, made=np.full(ROWS, 0.2)) is None  # too little by what drives it
+    bursts = np.where(T % 30.0 < 3.0, 10.0, 1.0) * error  # and where blocks differ so much that bins tell little
+    assert said(bursts, window=1.0, own=white, made=np.full(ROWS, 0.2)) is None
     through = said(error, window=1.0, own=white, made=np.full(ROWS, 9.0))  # but it may come in by what drives it
     assert through is not None and through.share > 0.5
 

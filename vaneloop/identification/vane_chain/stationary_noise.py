@@ -161,7 +161,8 @@ def _noise_in(judge: LeastSquaresProblem, k: int, error: Array, made: Array, out
     signed = np.maximum(np.abs(mean) - 2.0 * of_mean, 0.0) ** 2 > of_sign
     spectrum = np.abs(np.fft.rfft(np.nan_to_num(counted - np.nanmean(counted)))) ** 2
     line = float(np.convolve(spectrum, np.ones(3), "same").max() / spectrum.sum())
-    told = line < NOISE_ALIKE * excess and float(np.median(deviation)) <= 0.5 * NOISE_ALIKE * excess
+    short = 1.0 - float(expected.sum() / square.sum())  # where own noise and that of the channel are not enough
+    told = line < NOISE_ALIKE * excess and max(short, float(np.median(deviation))) <= 0.5 * NOISE_ALIKE * excess
     if not told or max(np.mean(differs), np.mean(signed)) > NOISE_BY_CHANCE:
         return None
     return Expected(float(np.sqrt(whole)), float(share))
