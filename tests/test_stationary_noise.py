@@ -20,7 +20,7 @@ from tests.test_recorders import verdicts
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.vane_chain.chain import build_chain
-from vaneloop.identification.vane_chain.stationary_noise import Expected, _noise_in, _over_blocks, like
+from vaneloop.identification.vane_chain.stationary_noise import Expected, _noise_in, _over_blocks, bounded, like
 from vaneloop.identification.workflow import diagnose
 
 DT, ROWS = 0.01, 30_000
@@ -115,6 +115,16 @@ def test_drawn_noise_has_the_power_and_the_colour_of_what_was_seen(seed: int, ta
     assert np.std(drawn) == pytest.approx(np.std(seen), rel=0.15)
     lag = round(tau / DT)
     assert np.mean(drawn[lag:] * drawn[:-lag]) / np.var(drawn) == pytest.approx(np.exp(-1.0), abs=0.15)
+
+
+@given(st.integers(0, 2**31), st.lists(st.floats(-2.0, 5.0), min_size=2, max_size=2))
+def test_bounded_least_squares_are_those_of_scipy(seed: int, truth: list[float]) -> None:
+    rng, most = np.random.default_rng(seed), np.array([1.0, 4.0])
+    a = rng.uniform(0.0, 1.0, (20, 2))
+    b = a @ truth + 0.1 * rng.standard_normal(20)
+    ours, theirs = bounded(a, b, most), scipy.optimize.lsq_linear(a, b, ([0.0, 0.0], most), tol=1e-14).x
+    assert np.all((ours >= 0.0) & (ours <= most))
+    assert np.sum((a @ ours - b) ** 2) <= np.sum((a @ theirs - b) ** 2) * (1.0 + 1e-9)
 
 
 def test_the_jackknife_over_blocks_is_the_deviation_of_a_mean() -> None:

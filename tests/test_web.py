@@ -1054,7 +1054,8 @@ def test_channels_of_channels_one_over_the_other_and_what_is_between_the_cursors
     choose(page, "faulted.csv")
     page.get_by_text("position 7: no channel 'x_dem'").wait_for()
     page.get_by_text("v [mm/s] = rate(x_lvdt), 3,000 samples").wait_for()
-    assert page.get_by_label("cursor 1 [s]").input_value() == ""
+    cursor = page.get_by_label("cursor 1 [s]").element_handle()
+    page.wait_for_function("field => field.value === ''", arg=cursor)
     page.get_by_role("button", name="take lag away").click()
     page.get_by_text("position 7: no channel 'x_dem'").wait_for(state="detached")
 

@@ -258,7 +258,8 @@ def bins_of(judge: LeastSquaresProblem, output: int, values: Array) -> Bins | No
     edges = _edges(values[use])
     blocks = len(judge.block_start)
     block_of = np.repeat(np.arange(blocks), np.diff(judge.block_start, append=len(use)))[use]
-    return Bins(edges, use, np.clip(np.digitize(values[use], edges) - 1, 0, len(edges) - 2), block_of, blocks)
+    bin_of = np.clip(np.digitize(values[use], edges) - 1, 0, len(edges) - 2)
+    return Bins(edges, use, bin_of, block_of, blocks)
 
 
 def regimes(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> list[Regime]:

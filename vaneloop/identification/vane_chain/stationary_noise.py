@@ -21,7 +21,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
 from vaneloop.identification.regimes import bins_of
@@ -38,7 +37,7 @@ from vaneloop.identification.subsystem import Array, Stage, noise_of
 from vaneloop.identification.vane_chain.current import law_of
 from vaneloop.identification.vane_chain.subsystem_data import Made
 
-__all__ = ["expect_stationary_noise", "like"]
+__all__ = ["bounded", "expect_stationary_noise", "like"]
 
 # each subsystem after those that explain what drives it: the channel whose noise it may pass on
 ORDER: Mapping[str, str] = {"engine": "", "servo": "x_lvdt", "actuator": "i_cmd", "demand": "n_r", "linkage": "x_lvdt"}
@@ -142,13 +141,13 @@ def _noise_in(judge: LeastSquaresProblem, k: int, error: Array, made: Array, out
     count = n.sum(axis=1)
     whole = float(square.sum() / count.sum())
     counted = np.where(judge.valid[k], error, np.nan)
-    most = QUIET_KNOWN_TO**2 * _power(
+    own_most = QUIET_KNOWN_TO**2 * _power(
         _quietest(_windows(stage, np.where(judge.valid[k], output, np.nan), stage.window))
     )
     weight = 1.0 / (np.sqrt(count) * whole)
     a = np.array([whole * count, through.sum(axis=1)]).T
-    bounds = ([0.0, 0.0], [max(most / whole, 1e-9), QUIET_KNOWN_TO**2])
-    own, share = scipy.optimize.lsq_linear(a * weight[:, None], square.sum(axis=1) * weight, bounds).x * (whole, 1.0)
+    most = np.array([own_most / whole, QUIET_KNOWN_TO**2])
+    own, share = bounded(a * weight[:, None], square.sum(axis=1) * weight, most) * (whole, 1.0)
     excess = 1.0 - floor**2 / whole
     if whole <= ((1.0 + FLOOR_KNOWN) * floor) ** 2:
         return Expected(floor, 0.0)
@@ -168,11 +167,28 @@ def _noise_in(judge: LeastSquaresProblem, k: int, error: Array, made: Array, out
     return Expected(float(np.sqrt(whole)), float(share))
 
 
+def bounded(a: Array, b: Array, most: Array) -> Array:
+    """The least squares of a x = b, float64[rows, 2], with both x from 0 to ``most``: inside, or on an edge."""
+    inside = np.linalg.lstsq(a, b, rcond=None)[0]
+    if np.all((inside >= 0.0) & (inside <= most)):
+        return np.asarray(inside)
+    tried = []
+    for k in (0, 1):
+        for edge in (0.0, most[k]):
+            x = np.full(2, edge)
+            of = a[:, 1 - k]
+            x[1 - k] = np.clip(of @ (b - edge * a[:, k]) / max(of @ of, 1e-300), 0.0, most[1 - k])
+            tried.append(x)
+    return min(tried, key=lambda x: float(np.sum((a @ x - b) ** 2)))
+
+
 def _quietest(windows: Array) -> Array:
     """The quietest tenth of windows, float64[windows, samples], beside their trend: at least one, if there is any."""
     if not len(windows):
         return windows
-    level = scipy.signal.detrend(windows, axis=1)
+    place = np.linspace(-1.0, 1.0, windows.shape[1])
+    level = windows - windows.mean(axis=1, keepdims=True)
+    level = level - np.outer(level @ place / (place @ place), place)
     return np.asarray(level[np.argsort(level.std(axis=1))[: max(1, round(0.1 * len(level)))]])
 
 
