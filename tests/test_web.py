@@ -972,6 +972,9 @@ def test_curves_of_several_logs_with_their_events_layouts_and_exports(server: Se
     looks(page, "curves")
 
 
+FOCUSED = ".q-manual-focusable--focused"
+
+
 def pick(page: Any, field: str, name: str) -> None:
     """Choose an option of a field by keyboard."""
     tab_to(page, f"{field} input")
@@ -980,9 +983,10 @@ def pick(page: Any, field: str, name: str) -> None:
     options = page.locator(".q-menu").last.get_by_role("option").all_inner_texts()
     page.keyboard.press("Home")
     for _ in range(len(options)):
-        if page.locator(".q-manual-focusable--focused").last.inner_text() == name:
+        if (here := page.locator(FOCUSED).last.inner_text()) == name:
             break
         page.keyboard.press("ArrowDown")
+        page.wait_for_function(f"was => [...document.querySelectorAll('{FOCUSED}')].at(-1).innerText !== was", arg=here)
     page.keyboard.press("Enter")
     page.locator(".q-menu").wait_for(state="detached")
 
