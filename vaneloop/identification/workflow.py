@@ -93,7 +93,7 @@ def _one(work: _Work, i: int, tell: Callable[[], None] | None = None) -> tuple[S
             tell()
 
     d = as_compared(stage, diagnose_stage(stage, floor_of(stage), tick=tick, judged=work.judged))
-    if d.criterion == "noise_floor" and not d.final.effects:
+    if d.verdict != "missing" and d.criterion == "noise_floor" and not d.final.effects:
         d = _as_located(stage, d)
     return d, shape(LeastSquaresProblem(stage, d.floor), d.final) if _leaves(d) else []
 
