@@ -4,6 +4,7 @@ still, and the numbers that go into a tick and come out of it.
 
 from __future__ import annotations
 
+import gc
 import math
 import signal
 import struct
@@ -765,8 +766,6 @@ def test_what_a_run_asks_of_the_system_is_given_back(monkeypatch: pytest.MonkeyP
 
 
 def test_what_the_system_does_not_give_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    import gc
-
     system = System(monkeypatch, locks=-1, slack=0)
     gc.disable()
     try:

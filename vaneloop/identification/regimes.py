@@ -256,10 +256,8 @@ def bins_of(judge: LeastSquaresProblem, output: int, values: Array) -> Bins | No
     if use.sum() < 100 or np.ptp(values[use]) == 0.0:
         return None
     edges = _edges(values[use])
-    blocks = len(judge.block_start)
-    block_of = np.repeat(np.arange(blocks), np.diff(judge.block_start, append=len(use)))[use]
     bin_of = np.clip(np.digitize(values[use], edges) - 1, 0, len(edges) - 2)
-    return Bins(edges, use, bin_of, block_of, blocks)
+    return Bins(edges, use, bin_of, judge.block_of[use], judge.n_blocks)
 
 
 def regimes(judge: LeastSquaresProblem, fit: Fit, correlation: float) -> list[Regime]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -144,6 +145,11 @@ class LeastSquaresProblem:
                 away = away[away > 0]
                 out.append(float(np.median(away)) if len(away) else abs(p.value) or 1.0)
         return np.array([p.scale or v for p, v in zip(s.all_parameters(), out, strict=True)])
+
+    @cached_property
+    def block_of(self) -> Array:
+        """Number of the block that each sample is in, int64[samples]."""
+        return np.repeat(np.arange(self.n_blocks), np.diff(self.block_start, append=len(self.stage.t)))
 
     def errors(self, thetas: Array) -> Array:
         """Whitened errors float64[sets, outputs, samples], measured minus model; 0 where nothing was measured."""

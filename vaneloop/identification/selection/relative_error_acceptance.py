@@ -321,12 +321,11 @@ def structure(judge: LeastSquaresProblem, fit: Fit) -> float:
     if not features:
         return 0.0
     x = np.array([*features, np.ones(len(stage.t))]).T
-    block = np.repeat(np.arange(judge.n_blocks), np.diff(np.append(judge.block_start, len(stage.t))))
     total = left = 0.0
     for k in range(len(e)):
         use = judge.valid[k]
         for fold in range(4):
-            train, test = use & (block % 4 != fold), use & (block % 4 == fold)
+            train, test = use & (judge.block_of % 4 != fold), use & (judge.block_of % 4 == fold)
             if not test.any() or train.sum() < 3 * x.shape[1]:
                 continue
             a = x[train].T @ x[train]
