@@ -369,7 +369,7 @@ def first_of_eight_bins_beyond(chance: float, correlation: float) -> Any:
     white = np.sqrt(squares) * np.where(np.arange(8 * n) % 2, 1.0, -1.0)  # no neighbour is alike
     return SimpleNamespace(
         stage=stage, valid=np.ones((1, 8 * n), bool), floor=np.ones(1), errors=lambda _: white[None, None],
-        lost=lambda: np.ones((1, 8 * n)), block_start=np.arange(0, 8 * n, 50),
+        lost=lambda: np.ones((1, 8 * n)), block_of=np.arange(8 * n) // 50, n_blocks=-(-8 * n // 50),
     )  # fmt: skip
 
 
