@@ -5,6 +5,7 @@ differ.
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 
 from benchmarks.loggers import Logger, recorded
 from hil.figures import noise_floor
-from hil.logs import Channel, Log
+from hil.logs import Channel, Log, read_log, write_log
 from hil.logs.stale import stale_rows
 from tests import rig
 from tests.firmware_on_rig import firmware
@@ -34,11 +35,11 @@ def verdicts(chain: Chain) -> dict[str, str]:
     return {s.stage: s.verdict for s in diagnose(chain.stages, workers=1).stages}
 
 
-@given(st.integers(0, 2**31), st.integers(5, 39), st.sampled_from([0.0, 0.001, 1.0]))
+@given(st.integers(0, 2**31), st.integers(1, 39), st.sampled_from([0.0, 0.001, 1.0]))
 def test_rows_that_only_repeat_are_found_and_no_others(seed: int, length: int, digit: float):
-    """Noise of 1 in each of three channels; with a last digit of 1 single rows repeat by chance."""
+    """Noise of 1 in each of five channels; with a last digit of 1 single rows repeat by chance."""
     rng = np.random.default_rng(seed)
-    columns = rng.standard_normal((3, 2000)) * (3.0 if digit == 1.0 else 1.0)
+    columns = rng.standard_normal((5, 2000)) * (3.0 if digit == 1.0 else 1.0)
     columns = np.round(columns / digit) * digit if digit else columns
     assert not stale_rows(list(columns)).any()
     if digit == 1.0:
@@ -222,9 +223,30 @@ def test_noise_of_an_input_that_its_filter_makes_slow_is_in_the_floor():
 
 def test_what_a_last_digit_hides_is_one_error_as_long_as_it_stands():
     t, x = np.arange(40_000) * 0.01, 0.05 * np.repeat(np.arange(400.0), 100)
-    stands = _other_noise(t, x, 1)[0].reshape(400, 100).mean(axis=1)  # what else is in it is white
+    stands = _other_noise(t, x, 1).reshape(400, 100).mean(axis=1)  # what else is in it is white
     assert np.std(stands) == pytest.approx(0.05 / 12.0**0.5, rel=0.1)
     assert np.abs(np.corrcoef(stands[1:], stands[:-1])[0, 1]) < 0.15
+
+
+# A clean log as other people's recorders take it: nothing is missing in any subsystem.
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "logger",
+    [
+        Logger(100, resolution=1.0),
+        Logger(100, resolution=5.0),
+        Logger(20, resolution=5.0),
+        Logger(100, window=0.016, resolution=1.0),
+        Logger(1000, stale=(0.001, 6)),
+        Logger(1000, stale=(0.001, 34)),
+        Logger(100, stale=(0.001, 34)),
+    ],
+)
+def test_no_subsystem_of_a_clean_log_fails_whatever_its_recorder_rounds_and_repeats(logger: Logger, tmp_path: Path):
+    write_log(tmp_path / "log.parquet", recorded(fine(), logger, np.random.default_rng(1)))
+    chain = build_chain(read_log(tmp_path / "log.parquet", require=()))
+    d = diagnose(chain.stages, chain.not_observed, workers=1)
+    assert d.verdict == "none", [(s.stage, s.verdict, s.refused) for s in d.stages]
 
 
 @pytest.mark.parametrize("kept", [Logger(100), Logger(50, offset={"vanes": 0.02}, window=0.02)])

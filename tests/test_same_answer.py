@@ -261,10 +261,16 @@ def test_a_stroke_at_rest_after_gross_motion_has_finite_errors() -> None:
     """A running sum of squares may end a rounding below zero there, whose root is none."""
     n, draw = 6000, np.random.default_rng(4)
     i = np.where(np.arange(n) < 3000, 30.0 * np.sin(0.3 * np.arange(n)), 0.0)
-    columns = {"i_cmd": i, "p_s": np.full(n, 21.0), "t_oil": np.full(n, 40.0), "fresh": np.ones(n)}
+    columns = {
+        "i_cmd": i,
+        "p_s": np.full(n, 21.0),
+        "t_oil": np.full(n, 40.0),
+        "fresh": np.ones(n),
+        "missing": np.zeros(n),
+    }
     columns["x_lvdt"] = np.where(np.arange(n) < 3000, 24.0 + np.cumsum(i) * 0.01, 24.0) + draw.normal(0.0, 0.005, n)
     smooth = stroke.without_noise(np.arange(n) * 0.01, columns, build_plant())
-    for value in (smooth.stroke, smooth.distortion, smooth.uneven, smooth.left(draw)):
+    for value in (smooth.stroke, smooth.distortion, smooth.uneven, smooth.left(draw, np.zeros(n))):
         assert np.all(np.isfinite(value))
 
 

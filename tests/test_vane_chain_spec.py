@@ -343,7 +343,7 @@ def test_a_current_that_is_not_the_mean_of_its_ticks_is_made_that(what: str, sam
     t, mean = 0.01 * np.arange(600), law.mean(axis=1)
     before = mean + 0.1 * (np.roll(law[:, -1], 1) - law[:, -1])
     logged = {"": mean, SAMPLED: samples_of(law, samples), BEFORE: before}[what] + 0.05 * white(4, 600)
-    c = {"i_cmd": logged + 0.2}
+    c = {"i_cmd": logged + 0.2, "missing": np.zeros(600)}
     assert other_current(t, c, law, np.ones(600, dtype=bool), CALIBRATION, samples) == what
     assert c["i_cmd"] == pytest.approx(mean + 0.2, abs=0.3)
 
@@ -351,7 +351,7 @@ def test_a_current_that_is_not_the_mean_of_its_ticks_is_made_that(what: str, sam
 def test_the_current_of_every_tick_has_the_logged_mean() -> None:
     law = np.cumsum(white(5, 300, 10).ravel()).reshape(300, 10) * 0.1
     limit = 0.9e3 * CALIBRATION.scalars.current_limit
-    c = {"i_cmd": law.mean(axis=1) + 4.0}
+    c = {"i_cmd": law.mean(axis=1) + 4.0, "missing": np.zeros(300)}
     c["i_cmd"][200] = 1.01 * limit
     run = np.arange(300) >= 20
     ticks = between_rows(c, law, 0.3, run, CALIBRATION, None, 0)
@@ -362,6 +362,10 @@ def test_the_current_of_every_tick_has_the_logged_mean() -> None:
     assert ticks[rest, -1] == pytest.approx(law[rest, -1] + 4.0, abs=1e-9)  # the row's own tick is known
     assert np.std(ticks[rest, :-1] - law[rest, :-1]) == pytest.approx(0.3, rel=0.1)
     assert not np.array_equal(between_rows(c, law, 0.3, run, CALIBRATION, None, 1), ticks)
+    c["missing"][120:125], c["i_cmd"][120:125] = 1.0, 8.0  # rows without a sample: the law, or what stands there
+    bridged = [between_rows(c, law, 0.0, run, CALIBRATION, None, seed)[120:125] for seed in (0, 1)]
+    assert bridged[0] == pytest.approx(law[120:125] + 4.0, abs=1e-9) and np.all(bridged[1] == 8.0)
+    c["missing"][:], c["i_cmd"][120:125] = 0.0, law[120:125].mean(axis=1) + 4.0
     unknown = np.full(300, 2.0)
     assert between_rows(c, law, 0.0, run, CALIBRATION, unknown, 0).mean(axis=1) == pytest.approx(c["i_cmd"])
     assert between_rows(c, law, 0.0, run, CALIBRATION, unknown, 1).mean(axis=1) == pytest.approx(c["i_cmd"] + 2.0)
@@ -1032,7 +1036,8 @@ def test_the_stroke_without_its_noise_and_the_law_on_it_are_as_far_off_as_is_sai
         assert smooth.noise == pytest.approx(sigma, rel=0.06) and smooth.rows == rows
         assert smooth.off == pytest.approx(x - (smooth.stroke - _smoothed(smooth.off, rows)), abs=1e-9)
         left = np.std((smooth.stroke - known.stroke)[100:-100])
-        said = [np.std(smooth.left(np.random.default_rng(s))[100:-100] + smooth.distortion[100:-100]) for s in range(4)]
+        draws = [smooth.left(np.random.default_rng(s), np.zeros(len(t))) + smooth.distortion for s in range(4)]
+        said = [np.std(d[100:-100]) for d in draws]
         assert left < 0.45 * sigma and np.sqrt(np.mean(np.square(said))) == pytest.approx(left, rel=0.15)
     law, of_mean, of_some = servo_law(t, c | {"x_lvdt": x}, CALIBRATION, smooth, draws=4, samples=2)
     unknown = sigma * white(9, len(t), 10)
@@ -1125,10 +1130,11 @@ def test_a_controller_of_the_user_s_own_is_run_from_below_and_from_above(monkeyp
 def test_noise_of_an_input_counts_as_an_error_as_far_as_it_is_seen() -> None:
     t, grid = 0.01 * np.arange(6000), 0.5
     values = np.round(40.0 * np.sin(0.02 * t) / grid) * grid
-    for draw in _other_noise(t, values, 3):  # a digit: even over one step, and the same as long as the value is
+    for seed in range(3):  # a digit: even over one step, and the same as long as the value is
+        draw = _other_noise(t, values, seed)
         assert np.abs(draw).max() <= 0.5 * grid and np.ptp(draw) > 0.9 * grid
         assert not np.diff(draw)[np.diff(values) == 0.0].any()
-    one, two = _other_noise(t, np.sin(t) + 0.2 * white(3, 6000), 2)
+    one, two = (_other_noise(t, np.sin(t) + 0.2 * white(3, 6000), seed) for seed in (0, 1))
     assert one.std() == pytest.approx(0.2, rel=0.05) and abs(np.corrcoef(one, two)[0, 1]) < 0.05
     makes = np.array([white(k, 6000) for k in (1, 2, 3)])
     share, beyond = _by_noise(t, 0.5 * white(4, 6000), makes, 1e-3)

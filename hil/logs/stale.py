@@ -1,8 +1,8 @@
 """Rows that a logger wrote again because nothing new had come: every channel repeats the row before, to the last bit.
 
-A channel with noise in its last digit turns back in every second row, repeats itself by chance now and then, and seldom
-often on end. The noisy channel that does so least tells how many repeated rows on end are beyond chance. Without noise
-a machine at rest looks the same, and nothing is stale.
+A channel with noise in its last digit turns back in every second row, and repeats itself by chance now and then; where
+the machine rests more often, so that the rows around tell. The noise of two channels is independent: the chance that
+all repeat is the product of theirs. Without noise a machine at rest looks the same, and nothing is stale.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 __all__ = ["stale_rows"]
 
 CHANCE = 1e-6  # that any row of the log is taken for stale where all were sampled
-FEWEST = 2  # repeated rows on end; a single one may be a clock that ticked twice
+AROUND = 250  # rows on either side that tell how often a channel repeats itself
 NOISY = 0.3  # share of changes that go back on the one before; white noise: two thirds
 MOST = 0.5  # share of rows; where more repeat, the channels are slower than the rows
 
@@ -31,21 +31,22 @@ def stale_rows(columns: Sequence[np.ndarray]) -> np.ndarray:
         if not same.any():
             return out
     edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(np.int8), [0]])))
-    first, length = edges[::2] + 1, edges[1::2] - edges[::2]
-    long = length >= FEWEST
-    if not long.any():
-        return out
-    first, length = first[long], length[long]
-    for begin, many in zip(first, length, strict=True):
-        out[begin : begin + many] = True
-    others = [(v[1:] == v[:-1])[~out[1:]] for v in columns if _turns(v[~out]) >= NOISY]
-    if not others:
-        return np.zeros(rows, dtype=bool)
-    chance = float((min(o.sum() for o in others) + 1) / (len(others[0]) + 1))
-    for begin, many in zip(first, length, strict=True):
-        if chance**many * rows > CHANCE:
-            out[begin : begin + many] = False
-    return out if out.mean() <= MOST else np.zeros(rows, dtype=bool)
+    first, behind = edges[::2] + 1, edges[1::2] + 1
+    out[1:] = same
+    low, high = np.maximum(first - AROUND, 0), np.minimum(behind + AROUND, rows)
+
+    def around(those: np.ndarray) -> np.ndarray:
+        total = np.concatenate([[0], np.cumsum(those)])
+        return np.asarray(total[high] - total[low])
+
+    fresh, chance = around(~out) + 1.0, np.zeros(len(first))  # chance: its logarithm
+    noisy = [v for v in columns if _turns(v[~out]) >= NOISY]
+    for v in noisy:
+        chance += np.log((around(np.append(False, v[1:] == v[:-1]) & ~out) + 1.0) / fresh)
+    by_chance = chance * (behind - first) + np.log(rows) > np.log(CHANCE)
+    for begin, end in zip(first[by_chance], behind[by_chance], strict=True):
+        out[begin:end] = False
+    return out if noisy and out.mean() <= MOST else np.zeros(rows, dtype=bool)
 
 
 def _turns(v: np.ndarray) -> float:

@@ -83,6 +83,9 @@ def actuator_stage(driven: Driven) -> Stage:
         stage.hidden = hidden
         if not driven.again:
             stage.raster_error = np.hypot(stage.raster_error, hidden(stage.neutral()))
+            if c["missing"].any():  # and where samples of the current are missing, most of it
+                neutral = stage.neutral()[None]
+                stage.lost = simulate(neutral) - simulate(neutral, step_currents(others, dt, substeps))
 
     def kept(at: Array) -> Array:
         keep = run[at]

@@ -30,7 +30,7 @@ from vaneloop.identification.settings import COLOUR, EXPLAINED, LATE, LOW_PASS_R
 from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.vane_chain.current import law_of
 from vaneloop.identification.vane_chain.low_pass import AS_LOGGED, LOW_PASSES, LowPass
-from vaneloop.identification.vane_chain.resample import Grid, first_row
+from vaneloop.identification.vane_chain.resample import Grid, first_row, last_digit
 from vaneloop.identification.vane_chain.subsystem_data import VANES_LATE, Made
 
 __all__ = [
@@ -195,41 +195,48 @@ def _servo(stage: Stage) -> list[Late]:
         return []
     driven = stage.made.driven  # type: ignore[attr-defined]
     t, c, cal = driven.t, driven.columns, driven.calibration
-    width = int(round(WINDOW / RASTER))
-    rows = len(t) // width * width
-    whole = np.isfinite(stage.measured[0, :rows]).reshape(-1, width).all(axis=1)
-    if not whole.any():
+    use = np.isfinite(stage.measured[0])
+    window = (np.arange(len(t)) // round(WINDOW / RASTER))[use]
+    if not use.any():
         return []
 
     def centred(values: Array) -> Array:
-        v = values[:rows].reshape(-1, width)[whole]
-        return np.asarray((v - v.mean(axis=1, keepdims=True)).ravel())
+        v = values[use]
+        return np.asarray(v - (np.bincount(window, v) / np.maximum(np.bincount(window), 1))[window])
 
     def both(ticks: Array) -> tuple[Array, Array]:
         return centred(ticks.mean(axis=1)), centred(ticks[:, -1])
 
-    none, current = np.zeros(len(t)), centred(c["i_cmd"])
-    logged, stroke = {0.0: c["x_lvdt"]}, c["stroke"]
+    none, current, stroke = np.zeros(len(t)), centred(c["i_cmd"]), c["stroke"]
+    # of a row's noise the controller saw what is the sensor's, and not what is the recorder's: a share of it
+    shared = centred(c["x_lvdt"] - stroke)
+    shared /= max(float(np.linalg.norm(shared)), 1e-300)
 
-    def demanded(passed: LowPass) -> Both:
-        return both(law_of(c["x_dem"], none, cal, behind=passed))
+    # and what the demand's last digit hides the controller knew
+    hidden = last_digit(c["x_dem"], np.random.default_rng(0))
+
+    def demanded(passed: LowPass, x_dem: Array) -> Both:
+        return both(law_of(x_dem, none, cal, behind=passed))
 
     def demands(late: Array) -> list[Both]:
-        return [demanded(LowPass(late=-float(d))) for d in late]
+        return [demanded(LowPass(late=-float(d)), c["x_dem"]) for d in late]
 
     def strokes(late: Array) -> list[Both]:
-        return [both(law_of(none, _shifted(t, stroke, d), cal, logged.get(float(d)))) for d in late]
+        return [both(law_of(none, _shifted(t, stroke, d), cal)) for d in late]
 
     def least(last: int, late: Array, other: Array, d: Sequence[Both], x: Sequence[Both]) -> tuple[float, float, float]:
         left = current[None] - np.array([one[last] for one in d])
         own = np.array([one[last] for one in x])
         power = np.sum(left**2, axis=1)[:, None] - 2.0 * left @ own.T + np.sum(own**2, axis=1)[None]
+        power -= np.where(other == 0.0, (left @ shared)[:, None] - (own @ shared)[None], 0.0) ** 2
+        power -= hides[last]
         j, k = np.unravel_index(int(np.argmin(power)), power.shape)
         return float(power[j, k]), float(late[j]), float(other[k])
 
     step = 0.1 * LATE
     grid, fine, here = step * np.arange(-10, 11), step * np.arange(-8, 9) / 8.0, np.zeros(1)
     as_logged, found = (demands(here), strokes(here)), []
+    hides = [float(x @ x) for x in demanded(AS_LOGGED, hidden)]
     as_is = min(least(last, here, here, *as_logged)[0] for last in (0, 1))
     d, x = demands(grid), strokes(grid)
     for last in (0, 1):
@@ -247,25 +254,35 @@ def _servo(stage: Stage) -> list[Late]:
     passed = LowPass(late=-late_demand)
     if late_demand < -LEAST_LATE:  # all else is late: behind a low-pass, maybe
         own = current[None] - np.array(strokes(np.array([late_stroke]))[0])
-        tried = [_low_pass(kind, -late_demand, lambda f: own - np.array(demanded(f))) for kind in LOW_PASSES]
+
+        def left_by(passed: LowPass) -> tuple[Array, Array]:
+            e = own - np.array(demanded(passed, c["x_dem"]))
+            return e if late_stroke else e - np.outer(e @ shared, shared), np.array(demanded(passed, hidden))
+
+        tried = [_low_pass(kind, -late_demand, left_by) for kind in LOW_PASSES]
         passed = min(tried, key=lambda x: x[0])[1] if min(tried)[0] < left else passed
     lates = (Late(DEMAND, -passed.delay - passed.late, passed=passed), Late(("x_lvdt",), late_stroke))
     return [one for one in lates if abs(one.seconds) > LEAST_LATE]
 
 
-def _low_pass(kind: str, delay: float, errors: Callable[[LowPass], Array]) -> tuple[float, LowPass]:
-    """The low-pass of a kind, and how late it stands besides, that leave least of the ``errors`` (float64[kinds of
-    sample, values]), near this ``delay`` (s): least squares. Returns what is left, squared, and it.
+def _low_pass(kind: str, delay: float, errors: Callable[[LowPass], tuple[Array, Array]]) -> tuple[float, LowPass]:
+    """The low-pass of a kind, and how late it stands besides, that leave least near this ``delay`` (s). Returns what is
+    left, squared, and it.
+
+    errors  what a low-pass leaves, and what it makes of a draw of the noise of what passed it, each float64[kinds of
+            sample, values]. Least squares of the first less those of the second: else the low-pass that takes most off
+            the noise would be the best (Soederstroem, Automatica 43 (2007) 939, bias-compensated least squares)
     """
     found = []
     for sample in (0, 1):
         at, best = np.array([delay, 0.0]), (np.inf, AS_LOGGED)
         for _ in range(4):
-            e = errors(LowPass(kind, *at))[sample]
-            best = min(best, (float(e @ e), LowPass(kind, *at)))
+            e = [x[sample] for x in errors(LowPass(kind, *at))]
+            best = min(best, (float(e[0] @ e[0] - e[1] @ e[1]), LowPass(kind, *at)))
             step = 0.2 * LEAST_LATE
-            slopes = [(errors(LowPass(kind, *(at + d)))[sample] - e) / step for d in step * np.eye(2)]
-            at = at - np.linalg.lstsq(np.array(slopes).T, e, rcond=None)[0]
+            beside = [errors(LowPass(kind, *(at + d))) for d in step * np.eye(2)]
+            own, noise = (np.array([(x[k][sample] - e[k]) / step for x in beside]) for k in (0, 1))
+            at = at - np.linalg.lstsq(own @ own.T - noise @ noise.T, own @ e[0] - noise @ e[1], rcond=None)[0]
             at[0] = np.clip(at[0], 0.5 * delay, 2.0 * delay)
         found.append(best)
     return min(found)

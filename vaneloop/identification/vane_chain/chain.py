@@ -40,6 +40,7 @@ from vaneloop.identification.settings import (
     CHAIN_MEMORY,
     CURRENT_DRAWS,
     LEAST_FLOOR,
+    NOISE_DRAWS,
     OTHER_CURRENT,
     RASTER,
     SETTLE,
@@ -77,6 +78,7 @@ from vaneloop.identification.vane_chain.resample import (
     Grid,
     every_other,
     grid_of,
+    last_digit,
     no_gap_in_window,
     on_raster,
     regimes_of,
@@ -86,7 +88,7 @@ from vaneloop.identification.vane_chain.resample import (
 )
 from vaneloop.identification.vane_chain.servo import servo_stage
 from vaneloop.identification.vane_chain.stationary_noise import expect_stationary_noise
-from vaneloop.identification.vane_chain.subsystem_data import SAMPLED_OF, Driven
+from vaneloop.identification.vane_chain.subsystem_data import SAMPLED_OF, STROKE_OFF, Driven
 
 __all__ = ["STAGE_ORDER", "Chain", "build_chain"]
 
@@ -332,6 +334,8 @@ def _chain(
     have = {**columns, **motion.columns()}
     for name in explained & columns.keys():
         there = _sampled(log.channels[name], t, grid, known[name])
+        if name in gaps.lost:
+            there = ~gaps.lost[name] & (True if there is None else there)
         if name in VANES and name in gaps.far:  # a gap of one vane is none of the others
             there = gaps.fresh([name])[0] & (True if there is None else there)
         if there is not None:
@@ -372,6 +376,10 @@ def _chain(
                 between_rows(have, law, size, both.run, cal, unknown, seed) for seed in (0, 1)
             )
         have["stroke"] = smooth.stroke
+    if "linkage" in names and "x_lvdt" in have and resolution(have["x_lvdt"]):
+        digits = [last_digit(have["x_lvdt"], np.random.default_rng(k)) for k in range(NOISE_DRAWS)]
+        off_by = [smooth.smoothed(d) if "stroke" in have else d for d in digits]
+        have[STROKE_OFF] = np.array([passed.before(d, dt) for d in off_by]).T
     if "linkage" in names and "x_lvdt" in have and passed.kind:
         have["stroke"] = passed.before(have.get("stroke", have["x_lvdt"]), dt)
     coarse_current = None
@@ -423,7 +431,8 @@ def _chain(
             # besides
             coarse = make(driven.at(slice(None, None, 2), every_other(have, coarse_current), rows[::2]))
             lost = stage.run(stage.neutral()[None])[0][:, ::2] - coarse.run(coarse.neutral()[None])[0]
-            more, stage.lost = rms(coarse, lost), lost.repeat(2, axis=1)[None, :, : len(t)]
+            more, own = rms(coarse, lost), lost.repeat(2, axis=1)[None, :, : len(t)]
+            stage.lost = own if stage.lost is None else own + stage.lost
             stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
         if (apart := max(round(log.channels[c].apart / dt) for c in needs)) > 1:
             more = np.zeros(len(outputs))

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from controller import Calibration
-from hil.figures import noise_floor, resolution
+from hil.figures import noise_floor
 from plant import Plant, chain, places
 from plant.parameters import NAMES, derive
 from plant.stages import actuator_run, step_currents
@@ -33,6 +33,7 @@ from vaneloop.identification.settings import (
 )
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.vane_chain.low_pass import AS_LOGGED, LowPass, lagged
+from vaneloop.identification.vane_chain.resample import last_digit
 
 __all__ = [
     "BEFORE", "SAMPLED", "SLOW_CURRENTS", "Smooth", "between_rows", "law_of", "other_current", "samples_of",
@@ -64,7 +65,7 @@ def servo_law(
     how much their mean, and that of the ticks that `samples_of` gives for ``samples``, are off because not all of
     stroke and demand is logged, each float64[rows, draws].
     """
-    x_dem, x = c["x_dem"], c["x_lvdt"]
+    x_dem, x = c["x_dem"], np.where(c["missing"] == 0.0, c["x_lvdt"], smooth.stroke)
     gains = (cal.scalars.kp, cal.scalars.ki, cal.scalars.kff)  # A/m = mA/mm
     when = np.maximum(t[:, None] - RASTER + chain.TICK * np.arange(1, 11)[None], t[0])
     stroke = np.empty(when.shape)
@@ -75,19 +76,20 @@ def servo_law(
     law = np.empty(when.shape)
     _loop(*_demanded(x_dem, behind), stroke, *gains, law)
     # not known: the LVDT's noise in nine ticks, what smoothing leaves at the rows, the way between them, which is known
-    # as well as a straight line and a cubic agree, and what the logged demand's last digit hides
-    draw, step = np.random.default_rng(0), resolution(x_dem)
+    # as well as a straight line and a cubic agree, and what the last digits of logged demand and stroke hide
+    draw = np.random.default_rng(0)
     of_mean, of_some = np.empty((len(t), draws)), np.empty((len(t), draws))
     off, ticks = stroke, np.empty(when.shape)
     for k in range(draws):
-        left = smooth.left(draw) + smooth.distortion
+        digit = last_digit(x, draw)
+        left = smooth.left(draw, digit) + smooth.distortion
         _between(left, spline(left), off)
         off += between
         draw.standard_normal(out=ticks)
-        ticks *= smooth.noise
+        ticks *= smooth.white(digit)
         np.subtract(ticks, off, out=off)
-        off[:, -1] = 0.0
-        _loop(*_demanded(-step * draw.uniform(-0.5, 0.5, len(t)), behind), off, *gains, ticks)
+        off[:, -1] = -digit
+        _loop(*_demanded(last_digit(x_dem, draw), behind), off, *gains, ticks)
         of_mean[:, k], of_some[:, k] = ticks.mean(axis=1), samples_of(ticks, samples)
     return law, of_mean, of_some
 
@@ -154,7 +156,8 @@ def between_rows(
 
     Between two rows it is what the firmware's law makes of the stroke between them, and of the LVDT's noise in the nine
     ticks that nobody logged: any noise of that size, for it works like dither on a valve with hysteresis or overlap.
-    Where the law does not hold (not in mode RUN, at the current's limit) the current is the row's mean.
+    Where the law does not hold (not in mode RUN, at the current's limit) the current is the row's mean; where samples
+    of the row are missing, it is the law's.
 
     law      of `servo_law`
     size     mA, RMS of the LVDT's noise in the current
@@ -164,14 +167,20 @@ def between_rows(
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal(law.shape)
     noise[:, -1] = 0.0
-    slow = scipy.ndimage.uniform_filter1d(c["i_cmd"] - law.mean(axis=1), SMOOTH_ROWS[-1])  # the integral's constant
+    known = c["missing"] == 0.0
+    slow = scipy.ndimage.uniform_filter1d(  # the integral's constant
+        _bridged(c["i_cmd"] - law.mean(axis=1), known), SMOOTH_ROWS[-1]
+    )
     ticks = law + slow[:, None] + size * noise
     # the row's own tick is known; the others' noise was such that the mean comes out
-    ticks[:, :-1] += (c["i_cmd"] - ticks.mean(axis=1))[:, None] * (law.shape[1] / (law.shape[1] - 1.0))
+    more = np.where(known, c["i_cmd"] - ticks.mean(axis=1), 0.0)
+    ticks[:, :-1] += more[:, None] * (law.shape[1] / (law.shape[1] - 1.0))
     alone = ~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.scalars.current_limit)
     ticks[alone] = c["i_cmd"][alone, None]
     if unknown is not None and seed:
         ticks += (unknown + size * rng.standard_normal(len(law)))[:, None]
+    if seed:  # where samples are missing, straight lines are as likely
+        ticks[~known] = c["i_cmd"][~known, None]
     return np.asarray(ticks)
 
 
@@ -191,13 +200,15 @@ def other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Ca
 
     samples  of the current that the log has between two rows, whose mean stands there
     """
-    width = int(round(WINDOW / RASTER))
-    use = run & (np.abs(c["i_cmd"]) < 0.9e3 * cal.scalars.current_limit)
+    use = run & (c["missing"] == 0.0) & (np.abs(c["i_cmd"]) < 0.9e3 * cal.scalars.current_limit)
+    window = (np.arange(len(t)) // round(WINDOW / RASTER))[use]
+    count = np.bincount(window)
+    most = count > 0.5 * WINDOW / RASTER
 
     def misfit(model: Array) -> float:
-        e = np.where(use, c["i_cmd"] - model, np.nan)[: len(t) // width * width].reshape(-1, width)
-        e = e[np.isfinite(e).all(axis=1)]
-        return float(np.median(np.std(e, axis=1))) if len(e) else 0.0
+        e = (c["i_cmd"] - model)[use]
+        mean, square = (np.bincount(window, x)[most] / count[most] for x in (e, e * e))
+        return float(np.median(np.sqrt(np.maximum(square - mean**2, 0.0)))) if most.any() else 0.0
 
     mean = law.mean(axis=1)
     others = {SAMPLED: samples_of(law, samples), BEFORE: mean + 0.1 * (np.roll(law[:, -1], 1) - law[:, -1])}
@@ -240,11 +251,21 @@ class Smooth(NamedTuple):
     uneven: Array
     off: Array
 
-    def left(self, draw: np.random.Generator) -> Array:
-        """Error (mm) such as noise and model leave in the stroke at the rows: one draw."""
-        noise = self.noise * draw.standard_normal(len(self.off))
+    def left(self, draw: np.random.Generator, digit: Array) -> Array:
+        """Error (mm) such as noise and model leave in the stroke at the rows: one draw; ``digit``: what rounding of the
+        logged one has made of it.
+        """
+        noise = self.white(digit) * draw.standard_normal(len(self.off))
         uneven = self.uneven * draw.standard_normal(len(self.off))
-        return np.asarray(_smoothed(noise, self.rows) + uneven)
+        return np.asarray(self.smoothed(noise + digit) + uneven)
+
+    def white(self, digit: Array) -> float:
+        """RMS (mm) of the LVDT's noise without what rounding has made of it."""
+        return float(np.sqrt(max(self.noise**2 - float(np.mean(digit**2)), 0.0)))
+
+    def smoothed(self, values: Array) -> Array:
+        """What is left of ``values`` where the stroke was smoothed."""
+        return _smoothed(values, self.rows)
 
 
 def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = NOTHING) -> Smooth:
@@ -271,7 +292,8 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = 
     whole = scipy.ndimage.uniform_filter1d(c["fresh"], 5) > 0.999  # rows with their neighbours
     calibrated = _calibrated(step, dt, logged, whole)
     model = np.cumsum(np.where(whole, calibrated, logged))  # over a gap the model goes where the stroke went
-    off = c["x_lvdt"] - model
+    sampled = ~whole | (c["missing"] == 0.0)
+    off = _bridged(c["x_lvdt"] - model, sampled)
     tried = []
     for rows in SMOOTH_ROWS:
         smooth, own = _smoothed(off, rows), _weights(rows)[rows // 2]
@@ -281,7 +303,7 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = 
     noise = min(noise_floor(t, np.where(whole, off, np.nan)), size)
     half = rows // 4 * 2 + 1
     differs = smooth - _smoothed(off, half)
-    fast = np.abs(differs) > 2.0 * noise  # rather noisy than wrong
+    fast = sampled & (np.abs(differs) > 2.0 * noise)  # rather noisy than wrong
     wide, narrow, as_is = _weights(rows), np.zeros(rows), np.zeros(rows)
     narrow[(rows - half) // 2 : (rows + half) // 2] = _weights(half)
     as_is[rows // 2] = 1.0
@@ -301,6 +323,14 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = 
     uneven = np.sqrt(share * jerky)
     stroke, distortion = np.where(fast, c["x_lvdt"], model + smooth), np.where(fast, off - smooth, distortion)
     return Smooth(stroke, noise, rows, distortion, uneven, off)
+
+
+def _bridged(values: Array, known: Array) -> Array:
+    """Values with straight lines over the rows that are not ``known``."""
+    if known.all() or not known.any():
+        return values
+    at = np.arange(len(values))
+    return np.interp(at, at[known], values[known])
 
 
 def _calibrated(step: Array, dt: float, logged: Array, whole: Array) -> Array:

@@ -17,7 +17,7 @@ from vaneloop.identification.onset import that_begins
 from vaneloop.identification.settings import APPROACH, CURRENT_DRAWS, DEMAND_SAME, LEAST_FLOOR, RASTER, WARM_FRAMES
 from vaneloop.identification.subsystem import Array, Effect, Parameter, Stage
 from vaneloop.identification.vane_chain.parameters import bends, declared
-from vaneloop.identification.vane_chain.resample import lately, pieces_of
+from vaneloop.identification.vane_chain.resample import last_digit, lately, pieces_of
 from vaneloop.identification.vane_chain.subsystem_data import Driven, Made
 
 __all__ = ["demand_stage", "own_demand_stage"]
@@ -118,7 +118,7 @@ def demand_stage(driven: Driven) -> Stage:
     def value(theta: Array, name: str, neutral: float) -> float:
         return float(theta[at[name]]) if name in at else neutral
 
-    def simulate(thetas: Array, n_r: Array = n_r, signals: Array = signals) -> Array:
+    def simulate(thetas: Array, n_dem: Array = n_dem, n_r: Array = n_r, signals: Array = signals) -> Array:
         out = np.empty((len(thetas), 1, len(t)))
         other = np.empty(len(t))
         shift = next(bends(driven, thetas, signals, DEMAND_ADDS)) * 1e-3 if driven.curved else none
@@ -166,9 +166,10 @@ def demand_stage(driven: Driven) -> Stage:
         return stage
     neutral = stage.neutral()[None]
     as_logged, draws = simulate(neutral)[0, 0], []
-    for noise in _other_noise(t, n_r, CURRENT_DRAWS):
-        other = n_r + noise
-        run_of_it = simulate(neutral, other, driven._replace(columns=c | {"n_r": other}).signals())[0, 0]
+    for k in range(CURRENT_DRAWS):
+        came = last_digit(n_dem, np.random.default_rng(k))
+        other = {"n_dem": n_dem + came, "n_r": n_r + _other_noise(t, n_r, CURRENT_DRAWS + k)}
+        run_of_it = simulate(neutral, **other, signals=driven._replace(columns=c | other).signals())[0, 0]
         draws.append(np.where(np.isfinite(measured), run_of_it - as_logged, np.nan))
     by_noise = np.array(draws)
     share, beyond = _by_noise(t, measured - as_logged, by_noise, LEAST_FLOOR["demand"])
@@ -176,19 +177,13 @@ def demand_stage(driven: Driven) -> Stage:
     return stage
 
 
-def _other_noise(t: Array, values: Array, draws: int) -> list[Array]:
-    """Draws of noise such as a channel has: white, and the rounding of its last digit, which stays the same as long as
-    the value does.
-    """
-    step, size = resolution(values), noise_floor(t, values)
-    stands = np.cumsum(np.diff(values, prepend=values[0]) != 0.0)
-    white = max(size**2 - step**2 / 12.0, 0.0)
+def _other_noise(t: Array, values: Array, seed: int) -> Array:
+    """A draw of noise such as a measured channel has: the rounding of its last digit, and white."""
+    draw, hides = np.random.default_rng(seed), resolution(values) / 12.0**0.5
+    size = noise_floor(t, values)
+    white = max(size**2 - hides**2, 0.0)
     white = np.sqrt(white if white > 0.05 * size**2 else 0.0)
-    out = []
-    for seed in range(draws):
-        draw = np.random.default_rng(seed)
-        out.append(step * draw.uniform(-0.5, 0.5, len(t))[stands] + white * draw.standard_normal(len(t)))
-    return out
+    return last_digit(values, draw) + white * draw.standard_normal(len(t))
 
 
 def _by_noise(t: Array, error: Array, draws: Array, least: float) -> tuple[float, float]:

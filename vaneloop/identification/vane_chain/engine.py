@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from hil.figures import resolution
 from plant import chain, places
 from plant.stages import engine_run
 from vaneloop.identification.onset import that_begins
-from vaneloop.identification.settings import RASTER
+from vaneloop.identification.settings import NOISE_DRAWS, RASTER
 from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.vane_chain.parameters import declared, lanes
-from vaneloop.identification.vane_chain.resample import pieces_of
+from vaneloop.identification.vane_chain.resample import expect_draws, last_digit, pieces_of
 from vaneloop.identification.vane_chain.subsystem_data import Driven, Made
 
 __all__ = ["engine_stage"]
@@ -22,17 +23,18 @@ def engine_stage(driven: Driven) -> Stage:
     t, c, machine, _, outputs, run = driven[:6]
     parameters, effects, rows, si = declared("engine", driven)
     dt = float(t[1] - t[0])
-    n_dem = np.ascontiguousarray(c["n_dem"])
-    inner = 1
-    if dt > 1.5 * RASTER:  # between rows of a slow log the demand is taken to run straight
-        inner = int(round(dt / RASTER))
-        n_dem = np.interp(np.arange(len(t) * inner) / inner, np.arange(len(t)), n_dem)
+    inner = 1 if dt <= 1.5 * RASTER else int(round(dt / RASTER))
+
+    def between_rows(n_dem: Array) -> Array:  # of a slow log the demand is taken to run straight there
+        return np.interp(np.arange(len(t) * inner) / inner, np.arange(len(t)), n_dem)
+
+    logged = between_rows(c["n_dem"])
     signals = driven.signals()
     between = np.repeat(signals, inner, axis=1)
     pieces = pieces_of(c["stretch"])
     second = max(1, int(round(1.0 / dt)))
 
-    def simulate(thetas: Array) -> Array:
+    def simulate(thetas: Array, n_dem: Array = logged) -> Array:
         p = lanes(driven, thetas, rows, si)
         s = np.zeros((chain.N_STATE, len(thetas)))
         out = np.empty((len(n_dem), len(thetas)))
@@ -54,4 +56,9 @@ def engine_stage(driven: Driven) -> Stage:
     measured = driven.measured(run)
     stage = Stage("engine", outputs, ("%",), parameters, effects, simulate, t, measured)
     stage.made = Made(engine_stage, driven)
+    if resolution(c["n_dem"]) and not driven.again:
+        neutral = stage.neutral()[None]
+        digits = [last_digit(c["n_dem"], np.random.default_rng(k)) for k in range(NOISE_DRAWS)]
+        draws = [simulate(neutral, logged + between_rows(d))[0] for d in digits]
+        expect_draws(stage, np.array(draws) - simulate(neutral)[0])
     return stage

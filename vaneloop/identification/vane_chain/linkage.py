@@ -11,8 +11,8 @@ from vaneloop.identification.onset import that_begins
 from vaneloop.identification.settings import SETTLE, WINDOW
 from vaneloop.identification.subsystem import Array, Named, Stage
 from vaneloop.identification.vane_chain.parameters import declared, lanes, like_temperature, like_time
-from vaneloop.identification.vane_chain.resample import pieces_of, since
-from vaneloop.identification.vane_chain.subsystem_data import VANES_LATE, Driven, Made, excerpts
+from vaneloop.identification.vane_chain.resample import expect_draws, pieces_of, since
+from vaneloop.identification.vane_chain.subsystem_data import STROKE_OFF, VANES_LATE, Driven, Made, excerpts
 
 __all__ = ["linkage_stage"]
 
@@ -32,7 +32,7 @@ def linkage_stage(driven: Driven) -> Stage:
     begun = [o in c and bool(driven.sampled(o)[: round(WINDOW / dt)].any()) for o in machine.vanes]
     first = [np.deg2rad(np.median(c[o][:5])) if b else np.nan for o, b in zip(machine.vanes, begun, strict=True)]
 
-    def simulate(thetas: Array, t: Array = t, t_oil: Array = t_oil) -> Array:
+    def simulate(thetas: Array, t: Array = t, t_oil: Array = t_oil, x: Array = x) -> Array:
         p = lanes(driven, thetas, rows, si)
         derive(p, dt, dt)
         start = machine.start(stroke=x[0], n_r=n_r[0])
@@ -75,6 +75,10 @@ def linkage_stage(driven: Driven) -> Stage:
                 keep[piece[-last:]] = False
         return keep
 
+    if STROKE_OFF in c and not driven.again:
+        neutral = stage.neutral()[None]
+        as_logged = simulate(neutral)[0]
+        expect_draws(stage, np.array([simulate(neutral, x=x + 1e-3 * off)[0] - as_logged for off in c[STROKE_OFF].T]))
     stage.counted = kept
     stage.excerpt, stage.made = excerpts(linkage_stage, driven, stage, kept), Made(linkage_stage, driven)
     return stage

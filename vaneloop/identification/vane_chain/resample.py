@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from hil.figures import noise_floor
+from hil.figures import noise_floor, resolution
 from hil.logs import Channel, Log, LogError
 from hil.logs.held import COMMANDS, FEW, answers, held, taken
 from vaneloop.base.compiled import compiled
@@ -28,8 +28,10 @@ __all__ = [
     "Grid",
     "OfSubsystem",
     "every_other",
+    "expect_draws",
     "first_row",
     "grid_of",
+    "last_digit",
     "lately",
     "no_gap_in_window",
     "on_raster",
@@ -227,14 +229,18 @@ def _columns(
             if gone.any() or lacks.any():
                 far[name], missing[name] = gone, lacks
             continue
-        uniform = np.abs(np.diff(c.t) - step) < 0.3 * step
+        partly = np.zeros(len(t), dtype=bool)
+        uniform = float(np.mean(np.abs(np.diff(c.t) - step) < 0.3 * step)) > 0.98
         if name == "i_cmd" and step < 0.6 * dt:
             total = np.concatenate([[0.0], np.cumsum(c.values)])
             edge = np.searchsorted(c.t, np.concatenate([[when[0] - dt], when]) + 0.5 * step)
-            count = np.maximum(np.diff(edge), 1)
-            columns[name] = np.diff(total[edge]) / count
+            count = np.diff(edge)
+            columns[name] = np.diff(total[edge]) / np.maximum(count, 1)
+            partly = count < 0.75 * dt / step  # some of its samples are missing: straight lines between those there
+            between = when[partly, None] - dt * np.arange(10) / 10.0
+            columns[name][partly] = np.interp(between, c.t, c.values).mean(axis=1)
         elif (
-            uniform.mean() > 0.98 and abs(step - dt) < 0.02 * dt and not _between_rows(c, when, dt)
+            uniform and abs(step - dt) < 0.02 * dt and not _between_rows(c, when, dt)
             or name in ("n_dem", "x_dem", "state") or _held(c, step, dt)
         ):  # fmt: skip
             # rows of a regular logger: the nearest row, whatever its clock's jitter; commands and what comes in frames
@@ -248,10 +254,12 @@ def _columns(
         if name in grid.known:  # a gap is between samples; before the first and after the last there is none
             low, behind = grid.rows_of(name)
             away[(row < low) | (row >= behind)] = 0.0
-        # one or two rows are bridged, more are a gap
-        gone, lacks = away >= 1.5 * max(step, dt), away > 0.75 * max(step, dt)
+        # one or two rows are bridged, more are a gap; those bridged are not the channel's own
+        gone, lacks = away >= 1.5 * max(step, dt), partly | (away > 0.75 * (step if uniform else max(step, dt)))
         if lacks.any():
             far[name], missing[name] = gone, lacks
+            if name in ("n_dem", "x_dem"):
+                columns[name] = np.where(lacks, np.interp(when, c.t, c.values), columns[name])
     return {name: no_smaller(v) for name, v in columns.items()}, far, missing
 
 
@@ -292,14 +300,31 @@ def every_other(columns: dict[str, Array], current: Array | None = None) -> dict
     return out
 
 
+def last_digit(values: Array, draw: np.random.Generator) -> Array:
+    """What rounding to a channel's last digit may have taken off it, one draw: it changes where the channel does."""
+    changes = np.cumsum(np.diff(values, prepend=values[:1]) != 0.0)
+    return np.asarray(resolution(values) * draw.uniform(-0.5, 0.5, changes[-1] + 1)[changes])
+
+
 def rms(stage: Stage, difference: Array) -> Array:
     """RMS of a difference of outputs where the stage counts them, its windows' constants free: float64[outputs]."""
     e = np.where(np.isfinite(stage.measured), difference, np.nan)
     if stage.window:
         w = int(round(stage.window / (stage.t[1] - stage.t[0])))
         e = e[:, : e.shape[1] // w * w].reshape(len(e), -1, w)
-        e = (e - e.mean(axis=2, keepdims=True)).reshape(len(e), -1)
+        mean = np.nansum(e, axis=2, keepdims=True) / np.maximum(np.isfinite(e).sum(axis=2, keepdims=True), 1)
+        e = (e - mean).reshape(len(e), -1)
     return np.asarray(np.sqrt(np.nansum(e**2, axis=1) / np.maximum(np.isfinite(e).sum(axis=1), 1)))
+
+
+def expect_draws(stage: Stage, draws: Array) -> None:
+    """Have a stage expect errors such as these ``draws``, float64[draws, outputs, samples]: what of them stands so long
+    that it is not seen as noise of the stage's error counts as the raster's.
+    """
+    counts = np.where(np.isfinite(stage.measured), 1.0, np.nan)
+    shown = [[noise_floor(stage.t, output) for output in one * counts] for one in draws]
+    stands = np.mean([rms(stage, one) ** 2 for one in draws], axis=0) - np.mean(np.square(shown), axis=0)
+    stage.lost, stage.raster_error = draws, np.sqrt(np.maximum(stands, 0.0))
 
 
 def stretches(good: Array) -> Array:
