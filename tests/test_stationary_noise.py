@@ -18,9 +18,16 @@ from tests.firmware_on_rig import firmware
 from tests.rig import Hidden
 from tests.test_recorders import verdicts
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
-from vaneloop.identification.subsystem import Array, Stage
+from vaneloop.identification.subsystem import Array, Parameter, Stage
 from vaneloop.identification.vane_chain.chain import build_chain
-from vaneloop.identification.vane_chain.stationary_noise import Expected, _noise_in, _over_blocks, bounded, like
+from vaneloop.identification.vane_chain.stationary_noise import (
+    Expected,
+    _noise_in,
+    _of_parameters,
+    _over_blocks,
+    bounded,
+    like,
+)
 from vaneloop.identification.workflow import diagnose
 
 DT, ROWS = 0.01, 30_000
@@ -71,6 +78,25 @@ def test_what_is_the_same_under_every_condition_is_noise(seed: int, tau: float, 
 @given(st.integers(0, 2**31), st.sampled_from(sorted(PHYSICS)))
 def test_what_turns_on_a_condition_is_none(seed: int, law: str) -> None:
     assert said(PHYSICS[law](np.random.default_rng(seed).standard_normal(ROWS))) is None
+
+
+@given(st.integers(0, 2**31), st.floats(0.5, 2.0))
+def test_noise_does_not_follow_the_nominal_parameters_and_play_at_its_limit_does(seed: int, size: float) -> None:
+    """A slope of the output by a parameter; and two outputs, of which each is judged by itself."""
+    slope = np.array([np.sign(SPEED), SPEED])
+    nominal = (Parameter("a", 0.0, "mm", tolerance=0.1), Parameter("b", 0.0, "mm", tolerance=0.1))
+    white = np.random.default_rng(seed).standard_normal((2, ROWS)) + size * np.array(
+        [coloured(seed), coloured(seed + 1)]
+    )
+    for more in (0.0, 1.5):
+        stage = Stage("s", ("x", "y"), ("mm", "mm"), nominal, (), lambda p: p[:, :, None] * slope, T,
+                      white + np.array([[more], [0.0]]) * slope, floor=np.ones(2), memory=10.0)  # fmt: skip
+        judge = LeastSquaresProblem(stage, np.ones(2))
+        x, y = _of_parameters(judge, stage.neutral())
+        there = SPEED != 0.0
+        left = judge.errors(stage.neutral()[None])[0, 0]
+        assert x == pytest.approx((left @ slope[0]) ** 2 / there.sum() / (left @ left)) and y < 0.01
+        assert (x > 0.05) == (more > 0.0)
 
 
 def test_a_drift_in_every_window_is_no_noise() -> None:

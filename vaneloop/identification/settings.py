@@ -1502,7 +1502,7 @@ NOISE_ALIKE = setting(
 NOISE_BY_CHANCE = setting(
     0.05,
     "share",
-    "Such a share of the bins may be out of it by more than two standard deviations.",
+    "Such a share of the bins may be out of it by more than two standard deviations, and parameters may take it.",
     "principle: by chance one in twenty is",
 )
 QUIET_KNOWN_TO = setting(

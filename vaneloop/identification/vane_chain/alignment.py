@@ -154,7 +154,7 @@ def late_in_controller(stages: Sequence[Stage]) -> LateIn:
 
 def late_vanes(stages: Sequence[Stage]) -> LateIn:
     """Whether all vane angles stand late alike, and more and more where their clock is a fast one. They stand early
-    only where the actuator fits: a slow LVDT looks alike, but there, too.
+    only where the actuator has no such lag: a slow LVDT looks alike, but there, too.
     """
     of = _judged(stages)
     stage = of.get("linkage")
@@ -171,7 +171,7 @@ def late_vanes(stages: Sequence[Stage]) -> LateIn:
     late, before, after = _fit(stage, _moving(stage, shifted), 2)
     if not _explains(stage, before, after) or np.any(np.abs(late) >= LATE):
         return {}
-    if late[0] < 0.0 and "actuator" in of and not _fits(of["actuator"]):
+    if late[0] < 0.0 and "actuator" in of and _lvdt_lag(of["actuator"], -float(late[0])) > -0.5 * late[0]:
         return {}
     drift = float(late[1]) if abs(late[1]) > 2.0 * LEAST_LATE else 0.0  # less at either end of the log
     return {"linkage": (Late(stage.outputs, float(late[0]), drift / length, middle),)}
@@ -235,9 +235,10 @@ def _servo(stage: Stage) -> list[Late]:
 
     step = 0.1 * LATE
     grid, fine, here = step * np.arange(-10, 11), step * np.arange(-8, 9) / 8.0, np.zeros(1)
-    as_logged, found = (demands(here), strokes(here)), []
+    as_logged = (demands(here), strokes(here))
     hides = [float(x @ x) for x in demanded(AS_LOGGED, hidden)]
     as_is = min(least(last, here, here, *as_logged)[0] for last in (0, 1))
+    found = [(as_is, 0.0, 0.0)]
     d, x = demands(grid), strokes(grid)
     for last in (0, 1):
         _, late, _ = least(last, grid, here, d, as_logged[1])
@@ -260,7 +261,7 @@ def _servo(stage: Stage) -> list[Late]:
             return e if late_stroke else e - np.outer(e @ shared, shared), np.array(demanded(passed, hidden))
 
         tried = [_low_pass(kind, -late_demand, left_by) for kind in LOW_PASSES]
-        passed = min(tried, key=lambda x: x[0])[1] if min(tried)[0] < left else passed
+        _, passed = min([*tried, (left, passed)], key=lambda x: x[0])
     lates = (Late(DEMAND, -passed.delay - passed.late, passed=passed), Late(("x_lvdt",), late_stroke))
     return [one for one in lates if abs(one.seconds) > LEAST_LATE]
 
@@ -432,6 +433,16 @@ def _both_passed(stage: Stage) -> LowPass:
     scanned = min((behind("second order", rows * dt, True) for rows in LOW_PASS_ROWS), key=lambda x: x[0])[1].delay
     _, passed, left = min((behind(kind, scanned, False) for kind in LOW_PASSES), key=lambda x: x[0])
     return passed if _significant(stage, behind("", 0.0, True)[2], left) else AS_LOGGED
+
+
+def _lvdt_lag(stage: Stage, start: float) -> float:
+    """The lag (s) of the LVDT, beyond the nominal one, that suits the actuator best, from one to ``start`` with."""
+    if "lvdt_lag" not in stage.index() or _fits(stage):
+        return 0.0
+    judge, begin = LeastSquaresProblem(stage, np.asarray(stage.floor)), stage.neutral()
+    at = stage.index()["lvdt_lag"].start
+    begin[at] = start
+    return float(judge.fit(("lvdt_lag",), begin, 4).theta[at])
 
 
 def _fits(stage: Stage) -> bool:

@@ -6,6 +6,7 @@ What tells it from missing physics: it is the same under every condition. An err
 * its mean square in the bins of every condition is what is expected, within half of what exceeds the floor,
 * no bin has a mean that makes as much of it, or such a slope in the windows whose constant is free,
 * no line of its spectrum does: what swings has a cause,
+* the nominal parameters, beyond their tolerances, would take no more of it than chance allows,
 * but for the one bin in twenty that chance allows; and the bins are known well enough to tell.
 
 Expected is the output's own noise, which is no more than how the output moves where it is quietest, and a share of what
@@ -63,7 +64,8 @@ def expect_stationary_noise(stages: Sequence[Stage]) -> list[str]:
     notes = []
     for stage, through in ((of[name], through) for name, through in ORDER.items() if name in of):
         judge = LeastSquaresProblem(stage, np.asarray(stage.floor))
-        e = judge.errors(recalibrate(judge).theta[None])[0] * judge.floor[:, None]
+        theta = recalibrate(judge).theta
+        e = judge.errors(theta[None])[0] * judge.floor[:, None]
         squares = np.sum(e * e, axis=1) / np.maximum(judge.valid.sum(axis=1), 1)
         if np.any(squares > ((1.0 + FLOOR_KNOWN) * judge.floor) ** 2):
             draws = _draws(stage, through, noise[through]) if through in noise else None
@@ -73,7 +75,7 @@ def expect_stationary_noise(stages: Sequence[Stage]) -> list[str]:
             columns = stage.made.driven.columns  # type: ignore[attr-defined]
             found = [_noise_in(judge, k, e[k], made[k], columns[o]) for k, o in enumerate(stage.outputs)]
             expected = [one for one in found if one is not None]
-            if len(expected) < len(found):
+            if len(expected) < len(found) or np.any(_of_parameters(judge, theta) > NOISE_BY_CHANCE):
                 continue
             notes.append(_said(stage, expected, judge.floor))
             _expect(stage, expected, draws)
@@ -166,6 +168,19 @@ def _noise_in(judge: LeastSquaresProblem, k: int, error: Array, made: Array, out
     if not told or max(np.mean(differs), np.mean(signed)) > NOISE_BY_CHANCE:
         return None
     return Expected(float(np.sqrt(whole)), float(share))
+
+
+def _of_parameters(judge: LeastSquaresProblem, theta: Array) -> Array:
+    """Share of the power of each output's error that a straight step of all nominal parameters together would take."""
+    free = [i for i, p in enumerate(judge.stage.parameters) if p.tolerance > 0.0]
+    tries = np.repeat(theta[None], len(free) + 1, axis=0)
+    tries[np.arange(1, len(free) + 1), free] += [0.05 * judge.stage.parameters[i].tolerance for i in free]
+    e = judge.errors(tries)
+    out = []
+    for left, columns in zip(e[0], (e[1:] - e[0]).transpose(1, 2, 0), strict=True):
+        taken = columns @ np.linalg.lstsq(columns, left, rcond=None)[0]
+        out.append(float(taken @ taken) / max(float(left @ left), 1e-300))
+    return np.array(out)
 
 
 def bounded(a: Array, b: Array, most: Array) -> Array:
