@@ -50,7 +50,7 @@ from vaneloop.base.curve import DEGREE, FINE_SIDE, POINTS, SIDE, splines
 from vaneloop.base.durations import named_lag, period_of
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import write
-from vaneloop.base.forms import FORMS, product
+from vaneloop.base.forms import FORMS, NAMED, product
 from vaneloop.base.hull import nearest_within, within
 from vaneloop.base.hysteresis import stops_of
 from vaneloop.base.tables import Bound, Finite, Table, read
@@ -109,8 +109,9 @@ class Learned(Table):
     def numbers(self) -> tuple[str, ...]:
         """Names of its values: c1, c2, ... of splines, those of its formula."""
         if self.form:
-            own = next((f.numbers for f in FORMS if f.name == self.form), ())
-            other = next((f.numbers for f in FORMS if self.second and f.name == self.second.form), ())
+            own, other = (
+                NAMED[axis.form].numbers if axis and axis.form in NAMED else () for axis in (self, self.second)
+            )
             return (*own, *(f"second_{n}" for n in other[1:]))
         own = tuple(f"c{k + 1}" for k in range(len(self.values) - self.jump))
         return (*own, "jump") if self.jump else own
@@ -135,7 +136,7 @@ class Learned(Table):
         for where, axis in axes:
             if not self.low < self.high or not axis.low < axis.high:
                 raise InputError(f"{where}: low (={axis.low:g}) must be below high (={axis.high:g})")
-            if bool(axis.form) != bool(self.form) or axis.form and all(f.name != axis.form for f in FORMS):
+            if bool(axis.form) != bool(self.form) or axis.form and axis.form not in NAMED:
                 one_of = ", ".join(f"{f.name} ({len(f.numbers)} values)" for f in FORMS)
                 allowed = one_of if self.form else "none, as the first quantity has splines"
                 raise InputError(f"{where}: form (={axis.form!r}, {len(self.values)} values) must be one of {allowed}")
@@ -194,7 +195,7 @@ class Learned(Table):
             return self._grid(self.second)
         x = np.linspace(*self.ends, points)
         if self.form:
-            form = next(f for f in FORMS if f.name == self.form)
+            form = NAMED[self.form]
             return lambda values: np.broadcast_to(form.value(x, values), x.shape).astype(float)
         design = splines(np.asarray(self.knots, dtype=float), x)
         return np.column_stack([design, np.sign(x)]).__matmul__ if self.jump else design.__matmul__
@@ -203,7 +204,7 @@ class Learned(Table):
         side = FINE_SIDE if self.form else SIDE
         x, z = np.linspace(self.low, self.high, side), np.linspace(second.low, second.high, side)
         if self.form:
-            one, other = (next(f for f in FORMS if f.name == name) for name in (self.form, second.form))
+            one, other = NAMED[self.form], NAMED[second.form]
             return lambda values: product(one, other, x, z, values)
         nearest = nearest_within(np.array(second.been), *self._ends()) if second.been else slice(None)
         a, b = splines(np.array(self.knots), x), splines(np.array(second.knots), z)

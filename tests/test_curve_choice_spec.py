@@ -26,15 +26,25 @@ from vaneloop.identification.selection.relative_error_acceptance import Relative
 from vaneloop.identification.selection.rules import Decisions
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled import (
-    confirmation,
+    curve_choice,
     learning,
-    parametric_preference,
     parametric_substitution,
     screening,
     surface_search,
 )
-from vaneloop.identification.unmodelled.closed_form_fits import _is_shaped, effect_of, library_name, likely
-from vaneloop.identification.unmodelled.curve_candidates import Candidate, basis_for, usual
+from vaneloop.identification.unmodelled.closed_form_fits import (
+    Product,
+    _factors,
+    _is_shaped,
+    _likely,
+    _samples,
+    _text,
+    effect_of,
+    library_name,
+    likely,
+    likely_products,
+)
+from vaneloop.identification.unmodelled.curve_candidates import Candidate, basis_for, surface_of, usual
 from vaneloop.identification.unmodelled.fitted_candidate import (
     FittedCandidate,
     Outcome,
@@ -48,21 +58,10 @@ from vaneloop.identification.unmodelled.fitted_candidate import (
     with_held_out,
     without_its_lag,
 )
-from vaneloop.identification.unmodelled.learned_law import _trades, _with_formulas, band_of, range_of
-from vaneloop.identification.unmodelled.learned_surface import surface_law_of
+from vaneloop.identification.unmodelled.learned_law import _trades, _with_formulas, band_of, range_of, surface_law_of
 from vaneloop.identification.unmodelled.learning import CurveSearch
-from vaneloop.identification.unmodelled.likelihood_acceptance import above_the_noise, grain_of, in_grains
-from vaneloop.identification.unmodelled.problem import CurveProblem
+from vaneloop.identification.unmodelled.problem import CurveProblem, above_the_noise, grain_of, in_grains
 from vaneloop.identification.unmodelled.regressors import Quantity
-from vaneloop.identification.unmodelled.surface_candidates import surface_of
-from vaneloop.identification.unmodelled.surface_closed_forms import (
-    Product,
-    _factors,
-    _likely,
-    _samples,
-    _text,
-    likely_products,
-)
 from vaneloop.identification.user_models.terms import COLUMN, INPUT
 
 # docs/settings.md
@@ -304,19 +303,19 @@ def test_memory_is_confirmed_by_another_log_or_another_amplitude(case: str, side
     learner: Any = SimpleNamespace(
         decisions=Decisions(), change=lambda *_: {}, ground=SimpleNamespace(tests=frozenset())
     )
-    assert confirmation.another_confirms(learner, before, after) == (side < 1.0)
-    far, log = confirmation.moves(after)
+    assert curve_choice.another_confirms(learner, before, after) == (side < 1.0)
+    far, log = curve_choice.moves(after)
     assert far == pytest.approx(np.full(12, 2.0) if case == "another log" else [*[2.0] * 5, 3.0, *[4.0] * 6], rel=0.02)
     assert log.tolist() == ([0] * 6 + [1] * 6 if case == "another log" else [0] * 12)
-    found = confirmation._confirmation(learner, before, after)
+    found = curve_choice._confirmation(learner, before, after)
     assert found.limit == pytest.approx(limit) and found.left == pytest.approx(side * limit, rel=1e-6)
     learner.change = lambda *_: {"t": -0.5, "f": 0.0, "v": 0.3}  # validation logs say it themselves
     learner.ground.tests = frozenset("tv")
-    assert confirmation._confirmation(learner, before, after).left == pytest.approx(np.exp(-1.0))
-    assert confirmation._confirmation(learner, before, after).limit == pytest.approx(np.exp(-2.0 * LEAST_USE))
+    assert curve_choice._confirmation(learner, before, after).left == pytest.approx(np.exp(-1.0))
+    assert curve_choice._confirmation(learner, before, after).limit == pytest.approx(np.exp(-2.0 * LEAST_USE))
     before.fit.cost[:] = 0.0
     learner.change = lambda *_: {}
-    assert confirmation._confirmation(learner, before, after).left == np.inf  # where nothing was wrong
+    assert curve_choice._confirmation(learner, before, after).left == np.inf  # where nothing was wrong
 
 
 def test_one_amplitude_confirms_no_memory_and_what_remembers_nothing_needs_no_other() -> None:
@@ -326,36 +325,36 @@ def test_one_amplitude_confirms_no_memory_and_what_remembers_nothing_needs_no_ot
     for narrow, confirmed in ((1.45, False), (1.55, True)):
         after, before = remembering([np.concatenate([wave(1.0), wave(narrow)])], np.full(12, 1.0), np.full(12, 100.0))
         assert (
-            np.isfinite(confirmation._confirmation(learner, before, after).left)
+            np.isfinite(curve_choice._confirmation(learner, before, after).left)
             == confirmed
             == (narrow > OTHER_AMPLITUDE)
         )
     after, before = remembering([wave(1.0)], np.full(6, 1.0), np.full(6, 100.0))
-    assert not confirmation.another_confirms(learner, before, after)
-    assert confirmation._confirmation(learner, before, after).limit == pytest.approx(1.0 - LEAST_FALL)
-    assert confirmation.another_confirms(learner, before, tried("u"))
+    assert not curve_choice.another_confirms(learner, before, after)
+    assert curve_choice._confirmation(learner, before, after).limit == pytest.approx(1.0 - LEAST_FALL)
+    assert curve_choice.another_confirms(learner, before, tried("u"))
 
 
 def test_curves_stand_instead_of_laws_with_names_by_themselves_or_by_a_formula(monkeypatch: pytest.MonkeyPatch) -> None:
     learner: Any = SimpleNamespace(speaks=True, ground=SimpleNamespace(tests=frozenset("t")), change=lambda *_: {})
-    monkeypatch.setattr(confirmation, "better_than", lambda learner, named, t: t.candidate.name != "y.curve_of_poor")
+    monkeypatch.setattr(curve_choice, "better_than", lambda learner, named, t: t.candidate.name != "y.curve_of_poor")
     formula = ("f", tried("f", 1.1))
-    monkeypatch.setattr(confirmation, "fitted_formulas", lambda ground, t: [formula])
+    monkeypatch.setattr(curve_choice, "fitted_formulas", lambda ground, t: [formula])
     named, good, bad = tried("named", 5.0), tried("u", 1.2), tried("u", 4.9)
-    assert confirmation.instead_of(learner, named, [good])
-    assert not confirmation.instead_of(learner, named, [tried("poor", 1.2)])
-    assert bad.formulas is None and confirmation.instead_of(learner, named, [bad]) and bad.formulas == [formula]
+    assert curve_choice.instead_of(learner, named, [good])
+    assert not curve_choice.instead_of(learner, named, [tried("poor", 1.2)])
+    assert bad.formulas is None and curve_choice.instead_of(learner, named, [bad]) and bad.formulas == [formula]
     learner.speaks = False
-    assert not confirmation.instead_of(learner, named, [tried("u", 4.9)])
+    assert not curve_choice.instead_of(learner, named, [tried("u", 4.9)])
     learner.speaks = True
     slips = tried("stops_of_u", 4.9)
-    assert not confirmation.instead_of(learner, named, [slips])  # of what slips there is no formula
-    assert confirmation.instead_of(learner, named, [tried("u", 4.9, formulas=[formula]), slips])  # of the first one
-    assert not confirmation.instead_of(learner, named, [tried("u", 4.9, formulas=[]), slips])
+    assert not curve_choice.instead_of(learner, named, [slips])  # of what slips there is no formula
+    assert curve_choice.instead_of(learner, named, [tried("u", 4.9, formulas=[formula]), slips])  # of the first one
+    assert not curve_choice.instead_of(learner, named, [tried("u", 4.9, formulas=[]), slips])
     learner.change = lambda before, t: {"t": 0.2 if t.candidate.name == "y.curve_of_f" else -0.5, "f": 9.0}
-    assert confirmation.instead_of(learner, named, [tried("u", 4.9)])  # a test log confirms the curve itself
+    assert curve_choice.instead_of(learner, named, [tried("u", 4.9)])  # a test log confirms the curve itself
     learner.change = lambda *_: {"t": 0.2}
-    assert not confirmation.instead_of(learner, named, [good])  # and here speaks against all
+    assert not curve_choice.instead_of(learner, named, [good])  # and here speaks against all
 
 
 # ---- formulas --------------------------------------------------------------------------------------------------------
@@ -453,24 +452,24 @@ def test_a_curve_earns_its_place_by_a_formula(monkeypatch: pytest.MonkeyPatch) -
         asked.extend(t.candidate.quantity.name for t in some)
         return [[good] if t.candidate.quantity.name == "corner" else [] for t in some]
 
-    monkeypatch.setattr(parametric_preference, "all_in_their_place", formulas)
+    monkeypatch.setattr(curve_choice, "all_in_their_place", formulas)
     corner, far = (
         tried("corner", 6.0 * np.exp(0.9 * FORMULA_MAY_EARN)),
         tried("far", 6.0 * np.exp(1.1 * FORMULA_MAY_EARN)),
     )
     lag, smooth = tried("u", 6.0, memory=True), tried("smooth", 6.0)
     poor = [corner, far, lag, smooth]
-    assert parametric_preference.earning_by_formula(ordering(), before, poor, [best, *poor]) == [corner]
+    assert curve_choice.earning_by_formula(ordering(), before, poor, [best, *poor]) == [corner]
     assert asked == ["corner", "smooth"]
     home = tried("y", 4.9)  # at its place, and explains three quarters
-    monkeypatch.setattr(parametric_preference, "all_in_their_place", lambda ground, some: [[good] for _ in some])
-    assert parametric_preference.earning_by_formula(ordering(), before, [home], [tried("best", 1.0)]) == [home]
+    monkeypatch.setattr(curve_choice, "all_in_their_place", lambda ground, some: [[good] for _ in some])
+    assert curve_choice.earning_by_formula(ordering(), before, [home], [tried("best", 1.0)]) == [home]
 
 
 @pytest.mark.parametrize(("error", "there"), [(4.9, True), (5.2, False)])
 def test_what_is_at_its_place_stays_where_it_explains_most_of_the_error(error: float, there: bool) -> None:
     before, own = tried("none", 10.0), tried("y", error)  # a quarter of 99, and 1: 5.07 squared
-    assert bool(parametric_preference.at_its_place(before, [own, tried("u", 1.0)])) == there
+    assert bool(curve_choice.at_its_place(before, [own, tried("u", 1.0)])) == there
     assert pytest.approx(5.0744**2, rel=1e-4) == MOST_LEFT * 99.0 + 1.0
 
 
@@ -481,16 +480,16 @@ def test_what_harms_a_test_log_goes_where_one_near_the_best_does_not() -> None:
     before = tried("none", 9.0)
     for apart, kept in ((0.9 * NOT_INSTEAD, [fine]), (1.1 * NOT_INSTEAD, [bad, fine])):
         left = {"y.curve_of_bad": 0.0, "y.curve_of_fine": apart}
-        assert parametric_preference.harmless(learner, before, [bad, fine], left) == kept
+        assert curve_choice.harmless(learner, before, [bad, fine], left) == kept
     by_formula = tried("worse", loose=[tried("fine")])
     left = {"y.curve_of_bad": 0.0, "y.curve_of_worse": 0.1}
-    assert parametric_preference.harmless(learner, before, [bad, by_formula], left) == [by_formula]
+    assert curve_choice.harmless(learner, before, [bad, by_formula], left) == [by_formula]
 
 
 def test_memory_goes_where_a_curve_without_leaves_nothing_but_noise() -> None:
     lag, clean, poor = tried("u", 1.0, memory=True), tried("u", 1.05), tried("u", 1.3)
     before = tried("none", 9.0)
-    without = parametric_preference.without_memory
+    without = curve_choice.without_memory
     assert without(ordering(), before, [lag, clean]) == [clean] and without(ordering(), before, [lag, poor]) == [
         lag,
         poor,
@@ -502,37 +501,33 @@ def test_the_plainest_that_a_formula_says_comes_first_at_a_known_noise(monkeypat
     first, second, late = tried("y", 1.02), tried("u", 1.0), tried("time", 1.0)
     formula = tried("f", 1.0)
     monkeypatch.setattr(
-        parametric_preference,
-        "with_and_without_mean",
-        lambda ground, t: [formula] if t is second else [tried("g", 2.0)],
+        curve_choice, "with_and_without_mean", lambda ground, t: [formula] if t is second else [tried("g", 2.0)]
     )
-    monkeypatch.setattr(parametric_preference, "correlation_of", lambda judge, fit: 1.0)
+    monkeypatch.setattr(curve_choice, "correlation_of", lambda judge, fit: 1.0)
     left = {"y.curve_of_y": 0.02, "y.curve_of_u": 0.0, "y.curve_of_time": 0.0}
     learner = ordering()
     near = [first, second, late]
-    assert parametric_preference.said_first(learner, near, left) is near
+    assert curve_choice.said_first(learner, near, left) is near
     learner.ground.noise_known = True
-    assert parametric_preference.said_first(learner, near, left) == [second, first, late]
-    assert parametric_preference.said_first(learner, [late, first, second], left) == [late, first, second]
-    assert parametric_preference.said_first(learner, [first], left) == [first]
+    assert curve_choice.said_first(learner, near, left) == [second, first, late]
+    assert curve_choice.said_first(learner, [late, first, second], left) == [late, first, second]
+    assert curve_choice.said_first(learner, [first], left) == [first]
     learner.fails = lambda t: True
-    assert parametric_preference.said_first(learner, near, left) == near
+    assert curve_choice.said_first(learner, near, left) == near
     learner.fails = lambda t: False
     judge: Any = first.judge
     limit = np.sqrt((100.0 + 2.0 * rival_nats(judge, 100.0, 1.0)) / 100.0)
     for side in (0.999, 1.001):
         formula.fit.held_out = np.full(4, 25.0 * (side * limit) ** 2)
-        assert (parametric_preference.said_first(learner, near, left)[0] is second) == (side < 1.0)
+        assert (curve_choice.said_first(learner, near, left)[0] is second) == (side < 1.0)
 
 
 def test_what_a_curve_or_its_formulas_leave() -> None:
     t = tried("u", 3.0, formulas=[("f", tried("f", 2.0)), ("g", tried("g", 4.0))])
-    assert (
-        parametric_preference.leaves(t) == pytest.approx(2.0) and parametric_preference.leaves(tried("u", 3.0)) == 3.0
-    )
+    assert curve_choice.leaves(t) == pytest.approx(2.0) and curve_choice.leaves(tried("u", 3.0)) == 3.0
     before = tried("none", 4.5)
-    assert parametric_preference.better_than(ordering(), before, t)
-    assert not parametric_preference.better_than(ordering(), before, tried("u", 3.0))
+    assert curve_choice.better_than(ordering(), before, t)
+    assert not curve_choice.better_than(ordering(), before, tried("u", 3.0))
 
 
 def test_formulas_in_a_curve_s_place_are_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -544,15 +539,15 @@ def test_formulas_in_a_curve_s_place_are_made_once(monkeypatch: pytest.MonkeyPat
         return [("f", both[1])] if loose and both[1] else [("f", strict)] if not loose else []
 
     both: list[Any] = [strict, loose]
-    monkeypatch.setattr(parametric_preference, "fitted_formulas", made)
+    monkeypatch.setattr(curve_choice, "fitted_formulas", made)
     ground: Any = SimpleNamespace(shares=False)
     t = tried("u")
-    assert parametric_preference.in_its_place(ground, t) == [loose] == t.loose and asked == [True]
-    assert parametric_preference.in_its_place(ground, t) == [loose] and asked == [True]
-    assert parametric_preference.with_and_without_mean(ground, t) == [strict, loose]
+    assert curve_choice.in_its_place(ground, t) == [loose] == t.loose and asked == [True]
+    assert curve_choice.in_its_place(ground, t) == [loose] and asked == [True]
+    assert curve_choice.with_and_without_mean(ground, t) == [strict, loose]
     both[1] = None
-    assert parametric_preference.all_in_their_place(ground, [tried("u")]) == [[strict]]
-    assert parametric_preference.with_and_without_mean(ground, tried("u")) == [strict]
+    assert curve_choice.all_in_their_place(ground, [tried("u")]) == [[strict]]
+    assert curve_choice.with_and_without_mean(ground, tried("u")) == [strict]
 
 
 @pytest.mark.parametrize(("level", "enough"), [(0.0, True), (0.5, True), (-0.89, True), (-0.91, False), (-2.0, False)])

@@ -27,23 +27,29 @@ from vaneloop.identification.unmodelled import (
     screening,
     surface_search,
 )
-from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas, goes_on, likely
-from vaneloop.identification.unmodelled.curve_candidates import Candidate, UserModelCandidates, with_curves
-from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
-from vaneloop.identification.unmodelled.learned_law import law_of
-from vaneloop.identification.unmodelled.learned_surface import surface_law_of
-from vaneloop.identification.unmodelled.learning import CurveSearch
-from vaneloop.identification.unmodelled.regressors import Quantity, _acting, _differences, quantities
-from vaneloop.identification.unmodelled.screening import screened, smoothed
-from vaneloop.identification.unmodelled.spectral_lines import Course, Lines, _driven, _repeats
-from vaneloop.identification.unmodelled.surface_candidates import SurfaceCandidate, surface_of
-from vaneloop.identification.unmodelled.surface_closed_forms import (
+from vaneloop.identification.unmodelled.closed_form_fits import (
     Product,
-    as_the_law,
+    fitted_formulas,
     fitted_products,
+    goes_on,
+    likely,
     likely_products,
     reach_of,
 )
+from vaneloop.identification.unmodelled.curve_candidates import (
+    Candidate,
+    SurfaceCandidate,
+    UserModelCandidates,
+    surface_of,
+    with_curves,
+)
+from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
+from vaneloop.identification.unmodelled.learned_law import law_of, surface_law_of
+from vaneloop.identification.unmodelled.learning import CurveSearch
+from vaneloop.identification.unmodelled.parametric_substitution import as_the_law
+from vaneloop.identification.unmodelled.regressors import Quantity, _acting, _differences, quantities
+from vaneloop.identification.unmodelled.screening import screened, smoothed
+from vaneloop.identification.unmodelled.spectral_lines import Course, Lines, _driven, _repeats
 from vaneloop.identification.user_models.by_log import bind
 from vaneloop.identification.user_models.terms import COLUMN, INPUT, OUTPUT
 

@@ -37,6 +37,7 @@ from vaneloop.identification.settings import NEGATIVE_STOPS
 from vaneloop.identification.subsystem import Effect, Parameter, Stage
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas, goes_on
 from vaneloop.identification.unmodelled.curve_candidates import UserModelCandidates, candidates, on_logs, with_curves
+from vaneloop.identification.unmodelled.curve_choice import harmless
 from vaneloop.identification.unmodelled.fitted_candidate import (
     FittedCandidate,
     held_out,
@@ -45,7 +46,6 @@ from vaneloop.identification.unmodelled.fitted_candidate import (
     surely_more,
     told_by_others,
 )
-from vaneloop.identification.unmodelled.parametric_preference import harmless
 from vaneloop.identification.unmodelled.screening import best_step, starts_of
 from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.by_log import bind

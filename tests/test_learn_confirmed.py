@@ -16,10 +16,9 @@ from vaneloop.base.forms import FORMS
 from vaneloop.identification.candidates.closed_forms import begin
 from vaneloop.identification.candidates.library import FORCE_LAWS
 from vaneloop.identification.settings import NO_TURN, OTHER_AMPLITUDE
-from vaneloop.identification.unmodelled import confirmation as confirmed
-from vaneloop.identification.unmodelled.confirmation import moves, stands_before
+from vaneloop.identification.unmodelled import curve_choice as confirmed
+from vaneloop.identification.unmodelled.curve_choice import earning_by_formula, moves, stands_before
 from vaneloop.identification.unmodelled.learning import CurveSearch
-from vaneloop.identification.unmodelled.parametric_preference import earning_by_formula
 from vaneloop.identification.user_models.hysteresis_regressors import swings
 
 T = np.linspace(0.0, 28.0, 5601)  # s

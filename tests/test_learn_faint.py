@@ -14,7 +14,7 @@ from vaneloop.identification.selection.rules import EXCESS, GAIN, NEAR_NOISE, Al
 from vaneloop.identification.settings import FORMS_ALIKE, FORMS_REFITTED, NATS, PER_PARAMETER, RIVAL, RIVAL_NATS
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import _nearest
-from vaneloop.identification.unmodelled.likelihood_acceptance import above_the_noise, grain_of
+from vaneloop.identification.unmodelled.problem import above_the_noise, grain_of
 from vaneloop.identification.vane_chain.candidates import VaneChainCandidates, remade
 
 N = 30_000

@@ -14,11 +14,11 @@ from tests import rig
 from tests.firmware_on_rig import firmware
 from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.settings import RIVAL_NATS, SCREENED_BEND
-from vaneloop.identification.unmodelled import parametric_preference as by_formula
+from vaneloop.identification.unmodelled import curve_choice as by_formula
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
+from vaneloop.identification.unmodelled.curve_choice import said_first
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
 from vaneloop.identification.unmodelled.learning import CurveSearch
-from vaneloop.identification.unmodelled.parametric_preference import said_first
 from vaneloop.identification.vane_chain.candidates import VaneChainCandidates, remade
 from vaneloop.identification.vane_chain.chain import build_chain
 

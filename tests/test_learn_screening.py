@@ -16,9 +16,9 @@ from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.subsampled_search import excerpt_of
 from vaneloop.identification.settings import CURVES_QUICK, LAG_TIMES, LITTLE_TOLD
 from vaneloop.identification.unmodelled.curve_candidates import Candidate, UserModelCandidates
+from vaneloop.identification.unmodelled.curve_choice import leaves
 from vaneloop.identification.unmodelled.fitted_candidate import CandidateSource, FittedCandidate
 from vaneloop.identification.unmodelled.learning import CurveSearch
-from vaneloop.identification.unmodelled.parametric_preference import leaves
 from vaneloop.identification.unmodelled.screening import screened
 from vaneloop.identification.user_models.by_log import bind
 from vaneloop.identification.vane_chain.candidates import VaneChainCandidates

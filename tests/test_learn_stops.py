@@ -27,7 +27,7 @@ from vaneloop.base.hysteresis import RADII, slipped, weights_of
 from vaneloop.cli.main import main
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.settings import BEFORE_LOG
-from vaneloop.identification.unmodelled.confirmation import another_confirms
+from vaneloop.identification.unmodelled.curve_choice import another_confirms
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
 from vaneloop.identification.unmodelled.learning import CurveSearch
 from vaneloop.identification.user_models.hysteresis_regressors import forgotten, of_stops

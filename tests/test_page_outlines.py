@@ -35,8 +35,7 @@ from vaneloop.identification.regimes import Shape, locate
 from vaneloop.identification.results import Candidate, Found, StageDiagnosis
 from vaneloop.identification.subsystem import Effect, Parameter, Stage
 from vaneloop.identification.unmodelled.fitted_candidate import Outcome as Learning
-from vaneloop.identification.unmodelled.learned_law import LearnedLaw
-from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
+from vaneloop.identification.unmodelled.learned_law import LearnedLaw, LearnedSurface
 from vaneloop.identification.user_models.by_log import ByLog, Logs
 from vaneloop.identification.vane_chain.experiment import HEADS
 from vaneloop.identification.workflow import Diagnosis

@@ -20,23 +20,23 @@ from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import diagnose_stage
 from vaneloop.identification.settings import LEVEL_SPREAD
 from vaneloop.identification.subsystem import Array
-from vaneloop.identification.unmodelled.closed_form_fits import goes_on
-from vaneloop.identification.unmodelled.confirmation import stands_before
+from vaneloop.identification.unmodelled.closed_form_fits import Product, goes_on
 from vaneloop.identification.unmodelled.curve_candidates import (
     Candidate,
     UserModelCandidates,
     _further,
     basis_for,
     candidates,
+    may_be_of,
     shape_fits,
+    surface_of,
 )
+from vaneloop.identification.unmodelled.curve_choice import stands_before
 from vaneloop.identification.unmodelled.fitted_candidate import adds_what, channel_of, plain, strange
-from vaneloop.identification.unmodelled.learned_law import LearnedLaw, law_of
-from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
+from vaneloop.identification.unmodelled.learned_law import LearnedLaw, LearnedSurface, law_of
 from vaneloop.identification.unmodelled.learning import CurveSearch
-from vaneloop.identification.unmodelled.likelihood_acceptance import promises
+from vaneloop.identification.unmodelled.problem import promises
 from vaneloop.identification.unmodelled.python_law import python_law
-from vaneloop.identification.unmodelled.python_surface import python_surface
 from vaneloop.identification.unmodelled.regressors import Quantity, _alike, difference, quantities
 from vaneloop.identification.unmodelled.screening import best_step, starts_of
 from vaneloop.identification.unmodelled.spectral_lines import (
@@ -54,8 +54,6 @@ from vaneloop.identification.unmodelled.spectral_lines import (
     about,
     periods_along,
 )
-from vaneloop.identification.unmodelled.surface_candidates import may_be_of, surface_of
-from vaneloop.identification.unmodelled.surface_closed_forms import Product
 from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.by_log import bind
 from vaneloop.identification.user_models.terms import COLUMN, INPUT, OUTPUT
@@ -419,7 +417,7 @@ def product_of(one: str, other: str) -> LearnedSurface:
 @pytest.mark.parametrize("other", ["sign", "root"])
 def test_a_product_s_file_computes_the_product(one: str, other: str) -> None:
     law, space = product_of(one, other), dict[str, Any]()
-    exec(python_surface(law), space)
+    exec(python_law(law), space)
     space["test_surface"]()
     first, second = (next(f for f in FORMS if f.name == n) for n in (one, other))
     for y, w in ((-1.3, 1.5), (0.4, 2.9), (9.0, 9.0)):
@@ -430,7 +428,7 @@ def test_a_product_s_file_computes_the_product(one: str, other: str) -> None:
 
 def test_a_surface_s_file_is_its_table() -> None:
     law, space = product_of("line", "line"), dict[str, Any]()
-    exec(python_surface(replace(law, formulas=[])), space)
+    exec(python_law(replace(law, formulas=[])), space)
     space["test_surface"]()
     for y, w in ((-1.3, 1.5), (0.4, 2.9), (2.0, 3.0), (-2.0, 1.0)):
         assert space["surface"](y, w) == pytest.approx(y * w, abs=1e-6)

@@ -1068,18 +1068,13 @@ def test_learning_on_a_machine_takes_its_chain(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_first_law_is_written_as_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Surface(SimpleNamespace):
-        pass
-
-    monkeypatch.setattr(learn, "LearnedSurface", Surface)
     monkeypatch.setattr(learn, "python_law", lambda law, system: f"{law.name} {system}")
-    monkeypatch.setattr(learn, "python_surface", lambda law: f"surface {law.name}")
     own: Any = "pump"
     laws = [law("one"), law("two")]
     assert answer("learned", laws).write_python(tmp_path / "l.py", own) == tmp_path / "l.py"
     assert (tmp_path / "l.py").read_text() == "one pump"
-    answer("learned", [Surface(name="s"), law("two")]).write_python(tmp_path / "l.py")
-    assert (tmp_path / "l.py").read_text() == "surface s"
+    answer("learned", [law("s"), law("two")]).write_python(tmp_path / "l.py")
+    assert (tmp_path / "l.py").read_text() == "s None"
 
 
 class Beside(Own):

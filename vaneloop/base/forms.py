@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["FORMS", "Form", "product"]
+__all__ = ["FORMS", "NAMED", "Form", "product"]
 
 Array = np.ndarray
 KELVIN = 273.15
@@ -106,6 +106,7 @@ FORMS: tuple[Form, ...] = (
     Form("sine", "a sin(b q + c)", "{a} * math.sin({b} * q + {c})", 5, lambda q, n: n[0] * np.sin(n[1] * q + n[2]),
          ("a", "b", "c"), (("per", (3.0, 6.0, 12.0, 25.0)), ("plain", (0.0, 1.6, 3.1)))),
 )  # fmt: skip
+NAMED = {form.name: form for form in FORMS}
 
 
 def product(one: Form, other: Form, x: Array, z: Array, numbers: Array) -> Array:

@@ -112,9 +112,8 @@ def weigh(d: StageDiagnosis) -> None:
 def rms_per_output(judge: LeastSquaresProblem, fit: Fit) -> Array:
     """RMS error of each output in its unit, scaled from fitted to held-out blocks."""
     e = judge.errors(fit.theta[None])[0] * judge.floor[:, None]
-    counts = np.maximum(judge.valid.sum(axis=1), 1)
     inflation = np.sqrt(max(fit.held_out.sum(), 1e-300) / max(fit.cost.sum(), 1e-300))
-    return np.sqrt(np.sum(e * e, axis=1) / counts) * inflation
+    return np.sqrt(judge.mean_squares(e)) * inflation
 
 
 def at_bound(stage: Stage, fit: Fit, name: str) -> bool:

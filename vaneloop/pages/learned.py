@@ -9,8 +9,7 @@ import numpy as np
 
 from vaneloop.base.signals import heading
 from vaneloop.identification.unmodelled.fitted_candidate import Outcome
-from vaneloop.identification.unmodelled.learned_law import LearnedLaw
-from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
+from vaneloop.identification.unmodelled.learned_law import LearnedLaw, LearnedSurface
 from vaneloop.identification.user_models.by_log import ByLog
 from vaneloop.pages.by_log import curves_by_log, log_by_log
 from vaneloop.pages.decisions import Explained, explain

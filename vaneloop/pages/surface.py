@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vaneloop.base.signals import heading
-from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
+from vaneloop.identification.unmodelled.learned_law import LearnedSurface
 from vaneloop.pages.figures import Figure, Line, loop
 from vaneloop.pages.series import packed
 from vaneloop.pages.style import number

@@ -20,17 +20,14 @@ from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import answer_of, found_of, recalibrated, rms_of
 from vaneloop.identification.selection.rules import decisions_json
 from vaneloop.identification.settings import HARM, LEAST_FALL, UNKNOWN
-from vaneloop.identification.unmodelled.curve_candidates import SHAPES, UserModelCandidates, on_logs
+from vaneloop.identification.unmodelled.closed_form_fits import reach_of
+from vaneloop.identification.unmodelled.curve_candidates import SHAPES, SurfaceCandidate, UserModelCandidates, on_logs
 from vaneloop.identification.unmodelled.fitted_candidate import Outcome
-from vaneloop.identification.unmodelled.learned_law import law_of
-from vaneloop.identification.unmodelled.learned_surface import LearnedSurface, surface_law_of
+from vaneloop.identification.unmodelled.learned_law import LearnedSurface, law_of, surface_law_of
 from vaneloop.identification.unmodelled.learning import CurveSearch
-from vaneloop.identification.unmodelled.likelihood_acceptance import above_the_noise
-from vaneloop.identification.unmodelled.parametric_substitution import spoken
+from vaneloop.identification.unmodelled.parametric_substitution import as_the_law, spoken
+from vaneloop.identification.unmodelled.problem import above_the_noise
 from vaneloop.identification.unmodelled.python_law import python_law
-from vaneloop.identification.unmodelled.python_surface import python_surface
-from vaneloop.identification.unmodelled.surface_candidates import SurfaceCandidate
-from vaneloop.identification.unmodelled.surface_closed_forms import as_the_law, reach_of
 from vaneloop.identification.user_models.by_log import ByLog, as_given, bind
 from vaneloop.identification.vane_chain.candidates import VaneChainCandidates
 from vaneloop.pages.decisions import Explained
@@ -192,9 +189,7 @@ class Learned(Answer):
         system  the user's own model, to whose ``laws`` it can be added, or which calls it, of a difference; None: of
                 the vane chain, the function alone, as always where it is one of two quantities
         """
-        law = self.laws[0]
-        text = python_surface(law) if isinstance(law, LearnedSurface) else python_law(law, system)
-        return write(path, text)
+        return write(path, python_law(self.laws[0], system))
 
 
 def law_json(law: LearnedLaw) -> dict[str, Any]:

@@ -120,7 +120,7 @@ def tested(chain: Any, fits: Sequence[tuple[str, Fit, Fit]]) -> list[Tested]:
             n, rms = sums.samples.sum(axis=1), sums.rms() * judge.floor
         else:
             n = judge.valid.sum(axis=1)
-            rms = np.sqrt((judge.errors(thetas) ** 2).sum(axis=2) / np.maximum(n, 1)) * judge.floor
+            rms = np.sqrt(judge.mean_squares(judge.errors(thetas))) * judge.floor
         for k, signal in enumerate(stage.outputs):
             figures = float(rms[0, k]), float(rms[1, k]), float(judge.floor[k]), int(n[k])
             out.append(Tested(name, signal, stage.units[k], *figures))

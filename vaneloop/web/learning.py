@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from nicegui import ui
 
 from vaneloop.base.signals import heading
-from vaneloop.identification.unmodelled.learned_surface import LearnedSurface
+from vaneloop.identification.unmodelled.learned_law import LearnedSurface
 from vaneloop.pages.learned import BAND, COLUMNS, HOW, about, curve_figure, formula_rows, visited_figure
 from vaneloop.pages.story import floors
 from vaneloop.pages.style import capital

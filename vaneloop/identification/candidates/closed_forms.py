@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vaneloop.base.forms import FORMS, Form
+from vaneloop.base.forms import NAMED, Form
 from vaneloop.identification.settings import FORM_DAMPING, FORM_DIFFERENCE, FORM_ENOUGH, FORM_STEPS
 from vaneloop.identification.subsystem import Array
 
@@ -137,5 +137,5 @@ def text_of(form: Form, numbers: Array, quantity: str, above_zero: bool = False,
 
 def values_of(formula: Formula, q: Array) -> Array:
     """A formula at values of its quantity."""
-    form = next(f for f in FORMS if f.name == formula.form)
-    return np.broadcast_to(form.value(q, np.array(list(formula.numbers.values()))), q.shape).astype(float)
+    y = NAMED[formula.form].value(q, np.array(list(formula.numbers.values())))
+    return np.broadcast_to(y, q.shape).astype(float)

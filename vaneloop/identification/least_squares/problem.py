@@ -191,6 +191,10 @@ class LeastSquaresProblem:
         """Sum of squares per block: float64[sets, blocks]."""
         return np.add.reduceat(np.einsum("soi,soi->si", e, e), self.block_start, axis=1)
 
+    def mean_squares(self, errors: Array) -> Array:
+        """Mean square of ``errors``, float64[..., outputs, samples], over the samples of each output that count."""
+        return np.asarray(np.sum(errors * errors, axis=-1) / np.maximum(self.valid.sum(axis=1), 1))
+
     def columns(self, effects: tuple[str, ...]) -> Array:
         """Columns that a fit with these effects sets free."""
         s = self.stage

@@ -47,8 +47,18 @@ from vaneloop.identification.settings import (
 )
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import fitted_formulas
-from vaneloop.identification.unmodelled.confirmation import another_confirms, instead_of
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
+from vaneloop.identification.unmodelled.curve_choice import (
+    all_in_their_place,
+    another_confirms,
+    at_its_place,
+    earning_by_formula,
+    harmless,
+    instead_of,
+    leaves,
+    said_first,
+    without_memory,
+)
 from vaneloop.identification.unmodelled.fitted_candidate import (
     MEASURED,
     FittedCandidate,
@@ -62,18 +72,8 @@ from vaneloop.identification.unmodelled.fitted_candidate import (
     surely_more,
     without_its_lag,
 )
-from vaneloop.identification.unmodelled.likelihood_acceptance import grain_of, in_grains, promises
-from vaneloop.identification.unmodelled.parametric_preference import (
-    all_in_their_place,
-    at_its_place,
-    earning_by_formula,
-    harmless,
-    leaves,
-    said_first,
-    without_memory,
-)
 from vaneloop.identification.unmodelled.parametric_substitution import tell_each_by_its_formula
-from vaneloop.identification.unmodelled.problem import CurveProblem
+from vaneloop.identification.unmodelled.problem import CurveProblem, grain_of, in_grains, promises
 from vaneloop.identification.unmodelled.screening import screened, smoothed
 from vaneloop.identification.unmodelled.surface_search import SurfaceSelection
 from vaneloop.identification.user_models.exogenous_regressors import TIME

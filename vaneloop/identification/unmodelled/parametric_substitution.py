@@ -14,20 +14,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from vaneloop.base.forms import FORMS
+from vaneloop.base.forms import NAMED
 from vaneloop.identification.candidates.closed_forms import Formula, text_of
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.settings import HARM, LEAST_PARAMETER_LEFT, PER_PARAMETER, RIVAL
 from vaneloop.identification.subsystem import Array
-from vaneloop.identification.unmodelled.closed_form_fits import effect_of, fitted_formulas, goes_on
-from vaneloop.identification.unmodelled.curve_candidates import Candidate
+from vaneloop.identification.unmodelled.closed_form_fits import (
+    Product,
+    effect_of,
+    fitted_formulas,
+    fitted_product,
+    goes_on,
+    reach_of,
+)
+from vaneloop.identification.unmodelled.curve_candidates import Candidate, SurfaceCandidate
 from vaneloop.identification.unmodelled.fitted_candidate import CandidateSource, FittedCandidate, with_held_out
 from vaneloop.identification.unmodelled.learned_law import LearnedLaw
 from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.user_models.terms import runs
 
-__all__ = ["more_left", "spoken", "takes_mean_back", "tell_each_by_its_formula"]
+__all__ = ["as_the_law", "more_left", "spoken", "takes_mean_back", "tell_each_by_its_formula"]
 
 
 def spoken(
@@ -59,8 +66,7 @@ def spoken(
             as_well = as_well and max(tests, default=0.0) <= RIVAL
             if as_well and in_all[f.form] <= best + RIVAL:
                 formulas = [said if g is f else g for g in out[k].formulas]
-                form = next(g for g in FORMS if g.name == f.form)
-                reach = goes_on(learner.ground, c, form, np.array(list(said.numbers.values())))
+                reach = goes_on(learner.ground, c, NAMED[f.form], np.array(list(said.numbers.values())))
                 out[k], now = replace(out[k], spoken=said, reach=reach, formulas=formulas), t
                 break
     if len(out) > 1 and out[0].spoken:  # what patched the first curve may harm its formula
@@ -142,7 +148,7 @@ def _in_place(
 
     alone  the formula in the curve's place, without the curves after it
     """
-    form = next(f for f in FORMS if f.name == formula.form)
+    form = NAMED[formula.form]
     numbers = np.array(list(formula.numbers.values()))
     own = alone.fit.theta[: len(alone.judge.stage.parameters)].copy()
     if not takes_mean_back(formula.level, numbers, own, c.place):
@@ -168,3 +174,29 @@ def _in_place(
         error=rms_of(judge, fit), level=0.0,
     )  # fmt: skip
     return now.refitted(judge, fit, tuple(curves)), said
+
+
+def as_the_law(
+    learner: CurveProblem, tried: FittedCandidate, formulas: Sequence[Formula]
+) -> tuple[FittedCandidate, Product] | None:
+    """The simplest product that does as well as its surface, held out and on every test log, in its place as far as it
+    goes on; None where there is none.
+    """
+    c, ground = tried.candidate, learner.ground
+    assert isinstance(c, SurfaceCandidate)
+    for f in formulas:
+        alone = next((t for g, t in tried.formulas or () if g is f), None)
+        if alone is None or not isinstance(f, Product):
+            continue
+        theta, at = alone.fit.theta.copy(), len(alone.judge.stage.parameters)
+        theta[at:] = list(f.numbers.values())
+        if not takes_mean_back(f.level, theta[at:], theta[:at], c.place):
+            continue
+        got = fitted_product(ground, tried, *f.forms, theta, reach_of(ground, tried, f), False)
+        if got is None:
+            continue
+        said, now = got
+        held, tests = more_left(learner, tried, now, [now, tried])
+        if max([held, *tests]) <= RIVAL and isinstance(said, Product):
+            return now, said
+    return None

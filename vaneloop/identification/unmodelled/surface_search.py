@@ -27,11 +27,11 @@ from vaneloop.identification.settings import (
     UNKNOWN,
 )
 from vaneloop.identification.subsystem import Array
+from vaneloop.identification.unmodelled.closed_form_fits import fitted_products
+from vaneloop.identification.unmodelled.curve_candidates import SurfaceCandidate, may_be_of, surface_of
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate, Outcome, plain, strange
 from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.unmodelled.screening import smoothed
-from vaneloop.identification.unmodelled.surface_candidates import SurfaceCandidate, may_be_of, surface_of
-from vaneloop.identification.unmodelled.surface_closed_forms import fitted_products
 
 __all__ = ["SurfaceSelection"]
 

@@ -7,7 +7,7 @@ import numpy as np
 from plant.model import Learned
 from vaneloop.base.durations import folded
 from vaneloop.base.errors import InputError
-from vaneloop.base.forms import FORMS
+from vaneloop.base.forms import NAMED
 from vaneloop.identification.candidates.library import Law
 from vaneloop.identification.settings import CURVE_BOUND, LEVEL_SPREAD
 from vaneloop.identification.subsystem import Effect, Parameter, StageError
@@ -65,7 +65,7 @@ def from_file(name: str, law: Learned, data: Data) -> tuple[Placed, Effect]:
         law.check(f"curves.{name}")
     except InputError as e:
         raise StageError(str(e)) from None
-    form = next((f for f in FORMS if f.name == law.form), None) if law.second is None else None
+    form = NAMED.get(law.form) if law.second is None else None
     table, jump = runs(form, *law.ends) if form else (law.table(), None)
     if law.jump and not form:
         smooth = law.model_copy(update={"jump": False}).table()

@@ -307,7 +307,7 @@ def _fit(
     theta, late = recalibrate(judge).theta, np.zeros(terms) if start is None else start
     free = [i for i, p in enumerate(stage.parameters) if p.tolerance > 0.0]
     sizes = np.array([0.05 * stage.parameters[i].tolerance for i in free])
-    before = _mean_squares(judge, theta)
+    before = judge.mean_squares(judge.errors(theta)[0])
     for _ in range(4):  # each leaves a hundredth of an offset that is short against the motion
         at = LeastSquaresProblem(moved(late), floor)
         tries = np.repeat(theta[None], len(free) + 1, axis=0)
@@ -333,15 +333,10 @@ def _fit(
     offsets = [late]
     if frame:  # what comes in frames stands late by whole ones
         offsets.append(np.round(late / frame) * frame)
-    errors = [_mean_squares(LeastSquaresProblem(moved(x), floor), theta) for x in offsets]
+    tried = [LeastSquaresProblem(moved(x), floor) for x in offsets]
+    errors = [judge.mean_squares(judge.errors(theta)[0]) for judge in tried]
     k = min(range(len(offsets)), key=lambda k: float(errors[k].sum()))
     return offsets[k], before, errors[k]
-
-
-def _mean_squares(judge: LeastSquaresProblem, theta: Array) -> Array:
-    """Mean squared error of each output, in squared noise floors."""
-    e = judge.errors(theta[None])[0]
-    return np.asarray(np.sum(e * e, axis=1) / np.maximum(judge.valid.sum(axis=1), 1))
 
 
 def _explains(stage: Stage, before: Array, after: Array) -> bool:

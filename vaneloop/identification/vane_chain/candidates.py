@@ -285,8 +285,7 @@ class VaneChainCandidates:
         driven = stage.made.driven
         judge = LeastSquaresProblem(stage, self.floor)
         fit = judge.fit((), theta, 1)
-        error = float(np.max(np.sqrt(np.sum((judge.errors(fit.theta[None])[0] * judge.floor[:, None]) ** 2, axis=1)
-                                     / np.maximum(judge.valid.sum(axis=1), 1))))  # fmt: skip
+        error = float(np.sqrt(np.max(judge.mean_squares(judge.errors(fit.theta)[0] * judge.floor[:, None]))))
         known = []
         rows = np.isfinite(stage.measured).any(axis=0)
         for signal in QUANTITIES.values():

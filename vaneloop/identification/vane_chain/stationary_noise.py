@@ -66,8 +66,7 @@ def expect_stationary_noise(stages: Sequence[Stage]) -> list[str]:
         judge = LeastSquaresProblem(stage, np.asarray(stage.floor))
         theta = recalibrate(judge).theta
         e = judge.errors(theta[None])[0] * judge.floor[:, None]
-        squares = np.sum(e * e, axis=1) / np.maximum(judge.valid.sum(axis=1), 1)
-        if np.any(squares > ((1.0 + FLOOR_KNOWN) * judge.floor) ** 2):
+        if np.any(judge.mean_squares(e) > ((1.0 + FLOOR_KNOWN) * judge.floor) ** 2):
             draws = _draws(stage, through, noise[through]) if through in noise else None
             made = np.zeros_like(e)
             if draws is not None:  # as errors are: without the free constants
