@@ -23,7 +23,7 @@ from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
 from vaneloop.identification.unmodelled.learned_law import LearnedLaw
 from vaneloop.identification.unmodelled.regressors import Quantity
-from vaneloop.identification.user_models.hysteresis_regressors import is_memory
+from vaneloop.identification.user_models.exogenous_regressors import is_memory
 from vaneloop.identification.user_models.terms import COLUMN
 from vaneloop.identification.vane_chain.candidates import remade
 from vaneloop.identification.vane_chain.chain import Chain

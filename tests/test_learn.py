@@ -49,15 +49,15 @@ from vaneloop.identification.unmodelled.fitted_candidate import (
 from vaneloop.identification.unmodelled.screening import best_step, starts_of
 from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.by_log import bind
-from vaneloop.identification.user_models.exogenous_regressors import column_of
-from vaneloop.identification.user_models.hysteresis_regressors import (
+from vaneloop.identification.user_models.exogenous_regressors import (
+    column_of,
     lagged,
     lagged_name,
     named_lag,
     of_stops,
     share_given_back,
 )
-from vaneloop.identification.user_models.law_file import from_file
+from vaneloop.identification.user_models.injection_points import from_file
 from vaneloop.verbs.learn import learn
 from vaneloop.verbs.search import diagnose
 

@@ -19,7 +19,7 @@ from vaneloop.identification.settings import NO_TURN, OTHER_AMPLITUDE
 from vaneloop.identification.unmodelled import curve_choice as confirmed
 from vaneloop.identification.unmodelled.curve_choice import earning_by_formula, moves, stands_before
 from vaneloop.identification.unmodelled.learning import CurveSearch
-from vaneloop.identification.user_models.hysteresis_regressors import swings
+from vaneloop.identification.user_models.exogenous_regressors import swings
 
 T = np.linspace(0.0, 28.0, 5601)  # s
 

@@ -17,7 +17,7 @@ from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
 from vaneloop.identification.unmodelled.learning import CurveSearch
 from vaneloop.identification.unmodelled.screening import smoothed
 from vaneloop.identification.user_models.by_log import bind
-from vaneloop.identification.user_models.hysteresis_regressors import lagged, named_lag
+from vaneloop.identification.user_models.exogenous_regressors import lagged, named_lag
 
 SLIDE = System(
     "slide", "static", lambda u, p: p.gain * u.drive, inputs={"drive": "V"}, outputs={"place": "mm"},

@@ -31,7 +31,7 @@ from vaneloop.identification.unmodelled.regressors import quantities
 from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.by_log import bind
 from vaneloop.identification.user_models.exogenous_regressors import sides_of
-from vaneloop.identification.user_models.law_file import from_file
+from vaneloop.identification.user_models.injection_points import from_file
 from vaneloop.verbs.learn import learn
 
 D = "motor_minus_drum"

@@ -22,7 +22,7 @@ from plant.effects import N_STATE
 from tests import rig
 from tests.test_learn_vanes import WIDE, chain, columns, curved, law
 from vaneloop.base.errors import InputError
-from vaneloop.identification.user_models.hysteresis_regressors import lagged
+from vaneloop.identification.user_models.exogenous_regressors import lagged
 from vaneloop.identification.vane_chain.candidates import LAGGED, VaneChainCandidates, curve_effect, with_laws
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
 from vaneloop.identification.vane_chain.subsystem_data import Made

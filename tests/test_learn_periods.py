@@ -34,7 +34,7 @@ from vaneloop.identification.unmodelled.learning import CurveSearch
 from vaneloop.identification.unmodelled.spectral_lines import Course, Lines
 from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.exogenous_regressors import every
-from vaneloop.identification.user_models.law_file import from_file
+from vaneloop.identification.user_models.injection_points import from_file
 from vaneloop.verbs.learn import learn, learned
 from vaneloop.verbs.search import diagnose, diagnosed
 

@@ -30,7 +30,7 @@ from vaneloop.identification.settings import BEFORE_LOG
 from vaneloop.identification.unmodelled.curve_choice import another_confirms
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
 from vaneloop.identification.unmodelled.learning import CurveSearch
-from vaneloop.identification.user_models.hysteresis_regressors import forgotten, of_stops
+from vaneloop.identification.user_models.exogenous_regressors import forgotten, of_stops
 from vaneloop.identification.vane_chain.candidates import LAGGED, SLIPS, VaneChainCandidates, with_laws
 from vaneloop.identification.vane_chain.chain import build_chain
 from vaneloop.identification.vane_chain.subsystem_data import Made

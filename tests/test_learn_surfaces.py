@@ -32,7 +32,7 @@ from vaneloop.base.tables import read
 from vaneloop.identification import StageError
 from vaneloop.identification.unmodelled.curve_candidates import with_curves
 from vaneloop.identification.user_models.bound_system import BoundSystem
-from vaneloop.identification.user_models.law_file import from_file
+from vaneloop.identification.user_models.injection_points import from_file
 from vaneloop.verbs.learn import learn
 
 NAME = "outflow.gain_of_level_and_oil"

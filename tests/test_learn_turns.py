@@ -21,7 +21,7 @@ from vaneloop.identification.unmodelled.regressors import quantities
 from vaneloop.identification.unmodelled.spectral_lines import periods_along
 from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.exogenous_regressors import every
-from vaneloop.identification.user_models.law_file import from_file
+from vaneloop.identification.user_models.injection_points import from_file
 from vaneloop.pages.learned import about, curve_figure
 from vaneloop.verbs.learn import learn
 

@@ -52,7 +52,7 @@ DOORS: dict[str, tuple[str, ...]] = {
     "hil/inject/__main__.py": ("vaneloop.cli.inject",),  # python -m hil.inject
     # what a user describes is offered at the room's door
     "vaneloop/identification/__init__.py": (
-        "vaneloop.identification.user_models.load",
+        "vaneloop.identification.user_models.user_code",
         "vaneloop.identification.user_models.system",
     ),
 }

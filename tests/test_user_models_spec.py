@@ -29,7 +29,7 @@ from vaneloop.identification.user_models.bound_system import BoundSystem, steps_
 from vaneloop.identification.user_models.by_log import ByLog, Logs, _loaded, as_given, bind, parameter_warnings
 from vaneloop.identification.user_models.codegen import try_law
 from vaneloop.identification.user_models.data import Data, noise_of_channel, noise_of_neighbours, spikes, without_order
-from vaneloop.identification.user_models.exogenous_regressors import column_of, every, sides_of
+from vaneloop.identification.user_models.exogenous_regressors import column_of, every, forgotten, sides_of, swings
 from vaneloop.identification.user_models.experiment import (
     SHAPES,
     Limits,
@@ -39,11 +39,9 @@ from vaneloop.identification.user_models.experiment import (
     driven,
     recommend,
 )
-from vaneloop.identification.user_models.hysteresis_regressors import forgotten, swings
 from vaneloop.identification.user_models.injection_points import _size, nominal_course
-from vaneloop.identification.user_models.load import load_system
 from vaneloop.identification.user_models.motion import differentiated_to, highest_frequency, low_pass, motion, smoothed
-from vaneloop.identification.user_models.user_code import UserCode, _ends, cannot
+from vaneloop.identification.user_models.user_code import UserCode, _ends, cannot, load_system
 from vaneloop.identification.user_models.user_laws import Law
 
 # docs/settings.md

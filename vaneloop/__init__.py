@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from hil.logs import Channel, Log, read_log, write_log
     from vaneloop.base.errors import InputError
     from vaneloop.identification.subsystem import Parameter
-    from vaneloop.identification.user_models.load import load_system
     from vaneloop.identification.user_models.system import Record, System, unknown
+    from vaneloop.identification.user_models.user_code import load_system
     from vaneloop.identification.user_models.user_laws import Law
     from vaneloop.verbs.learn import learn
     from vaneloop.verbs.machine import Machine
@@ -48,7 +48,7 @@ _HOME = {
     "experiment": "vaneloop.verbs.search",
     "extend": "vaneloop.verbs.search",
     "learn": "vaneloop.verbs.learn",
-    "load_system": "vaneloop.identification.user_models.load",
+    "load_system": "vaneloop.identification.user_models.user_code",
     "locate": "vaneloop.verbs.search",
     "open_bus": "hil.bus.port",
     "read_log": "hil.logs",

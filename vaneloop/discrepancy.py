@@ -2,6 +2,6 @@
 
 import sys
 
-from vaneloop.identification.user_models.load import FormerName
+from vaneloop.identification.user_models.user_code import FormerName
 
 sys.modules[__name__] = FormerName(__name__, __doc__)

@@ -31,10 +31,8 @@ from vaneloop.identification.unmodelled.regressors import Quantity, difference, 
 from vaneloop.identification.unmodelled.spectral_lines import Course
 from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.by_log import Logs
-from vaneloop.identification.user_models.exogenous_regressors import DISTANCE, SINCE, TIME, WAY, every
-from vaneloop.identification.user_models.hysteresis_regressors import STOPS
-from vaneloop.identification.user_models.injection_points import nominal_course
-from vaneloop.identification.user_models.law_file import CURVE_LAW
+from vaneloop.identification.user_models.exogenous_regressors import DISTANCE, SINCE, STOPS, TIME, WAY, every
+from vaneloop.identification.user_models.injection_points import CURVE_LAW, nominal_course
 from vaneloop.identification.user_models.simulation import Placed
 from vaneloop.identification.user_models.system import System
 from vaneloop.identification.user_models.terms import COLUMN, INPUT, OUTPUT, Curve, Jump, Surface, Table

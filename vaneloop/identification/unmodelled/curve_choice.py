@@ -36,7 +36,7 @@ from vaneloop.identification.unmodelled.fitted_candidate import (
     strange,
 )
 from vaneloop.identification.unmodelled.problem import CurveProblem
-from vaneloop.identification.user_models.hysteresis_regressors import swings
+from vaneloop.identification.user_models.exogenous_regressors import swings
 
 __all__ = [
     "all_in_their_place",

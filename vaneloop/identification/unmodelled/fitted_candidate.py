@@ -16,8 +16,7 @@ from vaneloop.identification.settings import LEAST_FALL, LEAST_OF_NOISE, LEAST_S
 from vaneloop.identification.subsystem import Array, Effect, Stage
 from vaneloop.identification.unmodelled.curve_candidates import Candidate
 from vaneloop.identification.unmodelled.spectral_lines import Course
-from vaneloop.identification.user_models.exogenous_regressors import DISTANCE, SINCE, TIME, WAY
-from vaneloop.identification.user_models.hysteresis_regressors import forgotten, named_lag
+from vaneloop.identification.user_models.exogenous_regressors import DISTANCE, SINCE, TIME, WAY, forgotten, named_lag
 from vaneloop.identification.user_models.simulation import Placed
 
 __all__ = [

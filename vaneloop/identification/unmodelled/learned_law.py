@@ -21,8 +21,7 @@ from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import Ends, Product, fitted_formulas, likely, likely_products
 from vaneloop.identification.unmodelled.curve_candidates import Candidate, SurfaceCandidate
 from vaneloop.identification.unmodelled.fitted_candidate import CandidateSource, FittedCandidate
-from vaneloop.identification.user_models.exogenous_regressors import TIME
-from vaneloop.identification.user_models.hysteresis_regressors import STOPS, named_lag
+from vaneloop.identification.user_models.exogenous_regressors import STOPS, TIME, named_lag
 
 __all__ = ["Formula", "LearnedLaw", "LearnedSurface", "band_of", "law_of", "range_of", "surface_law_of"]
 

@@ -76,8 +76,7 @@ from vaneloop.identification.unmodelled.parametric_substitution import tell_each
 from vaneloop.identification.unmodelled.problem import CurveProblem, grain_of, in_grains, promises
 from vaneloop.identification.unmodelled.screening import screened, smoothed
 from vaneloop.identification.unmodelled.surface_search import SurfaceSelection
-from vaneloop.identification.user_models.exogenous_regressors import TIME
-from vaneloop.identification.user_models.hysteresis_regressors import share_given_back
+from vaneloop.identification.user_models.exogenous_regressors import TIME, share_given_back
 
 __all__ = ["CurveSearch"]
 

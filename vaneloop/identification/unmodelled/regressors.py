@@ -22,8 +22,16 @@ from vaneloop.identification.settings import (
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.user_models.bound_system import BoundSystem
 from vaneloop.identification.user_models.data import noise_of_channel
-from vaneloop.identification.user_models.exogenous_regressors import DISTANCE, MINUS, SINCE, TIME, WAY
-from vaneloop.identification.user_models.hysteresis_regressors import STOPS, is_memory, lagged_name
+from vaneloop.identification.user_models.exogenous_regressors import (
+    DISTANCE,
+    MINUS,
+    SINCE,
+    STOPS,
+    TIME,
+    WAY,
+    is_memory,
+    lagged_name,
+)
 from vaneloop.identification.user_models.injection_points import nominal_course
 from vaneloop.identification.user_models.motion import MOTION, highest_frequency, low_pass
 from vaneloop.identification.user_models.system import Record
@@ -56,7 +64,7 @@ class Quantity:
 
     @property
     def stops(self) -> bool:
-        """Whether a curve of it is a hysteresis (`identification.user_models.hysteresis_regressors`)."""
+        """Whether a curve of it is a hysteresis (`identification.user_models.exogenous_regressors`)."""
         return self.name.startswith(STOPS)
 
     @property

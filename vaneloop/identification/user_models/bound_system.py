@@ -35,8 +35,7 @@ from vaneloop.identification.settings import (
 )
 from vaneloop.identification.subsystem import Array, Effect, Parameter, Stage, StageError, size_of
 from vaneloop.identification.user_models.data import Data, noise_of_channel
-from vaneloop.identification.user_models.injection_points import Course, nominal_course, places
-from vaneloop.identification.user_models.law_file import from_file
+from vaneloop.identification.user_models.injection_points import Course, from_file, nominal_course, places
 from vaneloop.identification.user_models.simulation import Placed, Runner
 from vaneloop.identification.user_models.system import Record, System
 

@@ -27,8 +27,7 @@ from vaneloop.base.forms import Form
 from vaneloop.identification.settings import AT_ONCE
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.user_models.data import Data
-from vaneloop.identification.user_models.exogenous_regressors import MINUS
-from vaneloop.identification.user_models.hysteresis_regressors import STOPS, of_stops
+from vaneloop.identification.user_models.exogenous_regressors import MINUS, STOPS, of_stops
 
 __all__ = [
     "COLUMN",

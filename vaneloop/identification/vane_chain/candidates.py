@@ -37,8 +37,8 @@ from vaneloop.identification.subsystem import Array, Effect, Parameter, Stage
 from vaneloop.identification.unmodelled.curve_candidates import Candidate, basis_for
 from vaneloop.identification.unmodelled.regressors import Quantity
 from vaneloop.identification.unmodelled.spectral_lines import Course
-from vaneloop.identification.user_models.hysteresis_regressors import lagged_name
-from vaneloop.identification.user_models.law_file import CURVE_LAW
+from vaneloop.identification.user_models.exogenous_regressors import lagged_name
+from vaneloop.identification.user_models.injection_points import CURVE_LAW
 from vaneloop.identification.user_models.motion import smoothed
 from vaneloop.identification.user_models.simulation import Placed
 from vaneloop.identification.user_models.terms import COLUMN, Curve

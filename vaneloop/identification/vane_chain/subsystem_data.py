@@ -18,7 +18,7 @@ from vaneloop.base.durations import named_lag
 from vaneloop.base.hysteresis import RADII, slipped, stops_of
 from vaneloop.base.vanes import VANES
 from vaneloop.identification.subsystem import Array, Effect, Stage
-from vaneloop.identification.user_models.hysteresis_regressors import lagged
+from vaneloop.identification.user_models.exogenous_regressors import lagged
 from vaneloop.identification.user_models.motion import smoothed
 from vaneloop.identification.user_models.simulation import Placed
 from vaneloop.identification.vane_chain.low_pass import AS_LOGGED, LowPass
