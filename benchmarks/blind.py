@@ -19,17 +19,9 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.files import whole
 
 __all__ = [
-    "INSIDE",
-    "KINDS",
-    "add_learn_options",
-    "add_run_options",
-    "as_curve",
-    "print_shares",
-    "read_rows",
-    "run",
-    "share",
+    "INSIDE", "KINDS", "add_learn_options", "add_run_options", "as_curve", "print_shares", "read_rows", "run", "share",
     "write_rows",
-]
+]  # fmt: skip
 
 Row = dict[str, Any]
 KINDS = ("clean", "outside", "pair", "single")  # of what is hidden; outside: what the library does not have

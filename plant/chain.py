@@ -91,26 +91,10 @@ from plant.valve import valve_step
 from vaneloop.base.compiled import in_place, inlined
 
 __all__ = [
-    "N_STATE",
-    "STATE",
-    "SUBSTEPS",
-    "TICK",
-    "bent_reading",
-    "drive_step",
-    "driven_stroke",
-    "measured_stroke",
-    "place_rings",
-    "rest",
-    "rest_actuator",
-    "rotor_step",
-    "sample_lvdt",
-    "stem_angle",
-    "straightened",
-    "true_stroke",
-    "unloaded_ring_angle",
-    "vane_step",
-    "wake",
-]
+    "N_STATE", "STATE", "SUBSTEPS", "TICK", "bent_reading", "drive_step", "driven_stroke", "measured_stroke",
+    "place_rings", "rest", "rest_actuator", "rotor_step", "sample_lvdt", "stem_angle", "straightened", "true_stroke",
+    "unloaded_ring_angle", "vane_step", "wake",
+]  # fmt: skip
 
 TICK = 1e-3  # s, one servo tick
 SUBSTEPS = 10  # plant steps a tick: 10 kHz

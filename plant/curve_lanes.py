@@ -18,19 +18,9 @@ from vaneloop.base.compiled import compiled_free, inlined
 from vaneloop.base.curve import POINTS, between_points
 
 __all__ = [
-    "CURRENT",
-    "OWN_SPEED",
-    "alike",
-    "first_curved",
-    "gives",
-    "gives_at",
-    "gives_each",
-    "of_signal",
-    "on_curve",
-    "signal_of",
-    "site_of",
-    "tables_of",
-]
+    "CURRENT", "OWN_SPEED", "alike", "first_curved", "gives", "gives_at", "gives_each", "of_signal", "on_curve",
+    "signal_of", "site_of", "tables_of",
+]  # fmt: skip
 
 CURRENT, OWN_SPEED = S_CURRENT - SIGNAL_AT, S_N_R - SIGNAL_AT  # signals that change within a row of a log
 

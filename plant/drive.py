@@ -65,28 +65,10 @@ from plant.valve import valve_step
 from vaneloop.base.compiled import inlined
 
 __all__ = [
-    "Drive",
-    "DriveState",
-    "Feed",
-    "Plays",
-    "current",
-    "feed",
-    "flow_gain",
-    "gains",
-    "half_share",
-    "load_of",
-    "loaded_by",
-    "nominal_compliance",
-    "prepare",
-    "pressure",
-    "remembered",
-    "rest",
-    "root",
-    "step",
-    "stored",
-    "taken",
+    "Drive", "DriveState", "Feed", "Plays", "current", "feed", "flow_gain", "gains", "half_share", "load_of",
+    "loaded_by", "nominal_compliance", "prepare", "pressure", "remembered", "rest", "root", "step", "stored", "taken",
     "told",
-]
+]  # fmt: skip
 
 
 class DriveState(NamedTuple):

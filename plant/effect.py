@@ -14,18 +14,8 @@ from dataclasses import dataclass
 from vaneloop.base.vanes import VANES
 
 __all__ = [
-    "DEG",
-    "HYDRAULIC",
-    "KINDS",
-    "MOTOR",
-    "SITES",
-    "STAGES",
-    "T_REF",
-    "UNITS",
-    "Effect",
-    "Parameter",
-    "per_vane_stage",
-]
+    "DEG", "HYDRAULIC", "KINDS", "MOTOR", "SITES", "STAGES", "T_REF", "UNITS", "Effect", "Parameter", "per_vane_stage",
+]  # fmt: skip
 
 DEG = math.pi / 180.0
 T_REF = 40.0  # degC: oil temperature at which what grows with temperature is nil

@@ -91,19 +91,9 @@ from plant.prepared import with_effects
 from vaneloop.base.compiled import inlined
 
 __all__ = [
-    "Motor",
-    "MotorState",
-    "demand",
-    "load_of",
-    "load_torques",
-    "prepare",
-    "rated_speed",
-    "rest",
-    "sense",
-    "step",
-    "stored",
-    "taken",
-]
+    "Motor", "MotorState", "demand", "load_of", "load_torques", "prepare", "rated_speed", "rest", "sense", "step",
+    "stored", "taken",
+]  # fmt: skip
 
 
 class MotorState(NamedTuple):

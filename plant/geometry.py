@@ -41,17 +41,9 @@ from vaneloop.base.tables import Axis, Bound, Bounded, Quantity, Table, read
 from vaneloop.base.vanes import Staged
 
 __all__ = [
-    "STANDS_FOR",
-    "Crank",
-    "Geometry",
-    "Schedules",
-    "Stage",
-    "length_tolerances",
-    "load_geometry",
-    "load_schedules",
-    "stroke_for_vigv",
-    "vane_angles",
-]
+    "STANDS_FOR", "Crank", "Geometry", "Schedules", "Stage", "length_tolerances", "load_geometry", "load_schedules",
+    "stroke_for_vigv", "vane_angles",
+]  # fmt: skip
 
 MM = 1e-3
 DEG = math.pi / 180.0

@@ -37,15 +37,9 @@ from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank, stage_ring_angle
 from vaneloop.base.errors import InputError
 
 __all__ = [
-    "Clearances",
-    "clearance_for",
-    "clearance_loop",
-    "clearance_width",
-    "contributions",
-    "freedoms",
-    "plane_joints",
+    "Clearances", "clearance_for", "clearance_loop", "clearance_width", "contributions", "freedoms", "plane_joints",
     "spatial_angles",
-]
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 

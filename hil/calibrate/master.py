@@ -15,16 +15,8 @@ from hil.calibrate.errors import WORDS
 from hil.calibrate.memory import CALIBRATION
 
 __all__ = [
-    "CONNECT",
-    "PAGE_IN_USE",
-    "Master",
-    "copy_page",
-    "numbers_of",
-    "read_page",
-    "save_page",
-    "use_page",
-    "write_number",
-]
+    "CONNECT", "PAGE_IN_USE", "Master", "copy_page", "numbers_of", "read_page", "save_page", "use_page", "write_number",
+]  # fmt: skip
 
 CONNECT = b"\xff\x00"
 PAGE_IN_USE = b"\xea\x01\x00"  # of the firmware: the third byte behind 0xFF

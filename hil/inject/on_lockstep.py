@@ -31,17 +31,9 @@ if TYPE_CHECKING:
     from plant import Plant
 
 __all__ = [
-    "SENDER",
-    "TICK",
-    "Disturber",
-    "MachineChange",
-    "OnLockstep",
-    "changed_rows",
-    "check_stages",
-    "demand_at",
-    "sender_of",
-    "sent_by",
-]
+    "SENDER", "TICK", "Disturber", "MachineChange", "OnLockstep", "changed_rows", "check_stages", "demand_at",
+    "sender_of", "sent_by",
+]  # fmt: skip
 
 TICK = 1e-3  # s
 SENDER = {"ECU": ("ECU_DEMAND",), "VGV": tuple(n for n in frames.NAMES.values() if n != "ECU_DEMAND")}

@@ -19,18 +19,9 @@ from vaneloop.base.signals import SIDES
 from vaneloop.base.vanes import VANES
 
 __all__ = [
-    "CERTAIN",
-    "LONGEST_NAME",
-    "Meaning",
-    "bracketed",
-    "is_time",
-    "lacks",
-    "meaning",
-    "spool",
-    "unit_behind",
-    "unit_in_name",
-    "unit_kind",
-]
+    "CERTAIN", "LONGEST_NAME", "Meaning", "bracketed", "is_time", "lacks", "meaning", "spool", "unit_behind",
+    "unit_in_name", "unit_kind",
+]  # fmt: skip
 
 CERTAIN = 0.98  # of a name that says all that there is to say
 LONGEST_NAME = 1_000  # letters; no logger writes more, and what is longer means nothing here

@@ -19,18 +19,9 @@ from vaneloop.base.signals import SIDES
 from vaneloop.base.vanes import VANES
 
 __all__ = [
-    "FEW",
-    "JUMP",
-    "RANGES",
-    "Range",
-    "judge",
-    "latest",
-    "longest_part",
-    "out_of_order",
-    "span_complaint",
-    "too_small",
+    "FEW", "JUMP", "RANGES", "Range", "judge", "latest", "longest_part", "out_of_order", "span_complaint", "too_small",
     "unit_of_time",
-]
+]  # fmt: skip
 
 # share of a channel's samples (or a log's rows) that may be wrong one by one; more is a wrong unit, or a wrong clock
 FEW = 0.1

@@ -22,17 +22,9 @@ from vaneloop.base.lean import called_by_code
 from vaneloop.base.temporary import own_folder
 
 __all__ = [
-    "cache_folder",
-    "compiled",
-    "compiled_free",
-    "fused",
-    "in_place",
-    "in_place_free",
-    "inlined",
-    "is_cached",
-    "sources_digest",
-    "threads",
-]
+    "cache_folder", "compiled", "compiled_free", "fused", "in_place", "in_place_free", "inlined", "is_cached",
+    "sources_digest", "threads",
+]  # fmt: skip
 
 KEPT = 6
 

@@ -10,18 +10,9 @@ import scipy
 from vaneloop.base.compiled import compiled_free, inlined
 
 __all__ = [
-    "DEGREE",
-    "FINE",
-    "FINE_SIDE",
-    "POINTS",
-    "SIDE",
-    "between_points",
-    "on_even",
-    "on_even_grid",
-    "on_grid",
-    "on_table",
+    "DEGREE", "FINE", "FINE_SIDE", "POINTS", "SIDE", "between_points", "on_even", "on_even_grid", "on_grid", "on_table",
     "splines",
-]
+]  # fmt: skip
 
 DEGREE = 3  # of its splines
 POINTS = 257  # of a table, evenly spaced from its lowest to its highest argument

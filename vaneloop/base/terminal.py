@@ -20,7 +20,7 @@ import tempfile
 import termios
 import traceback
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NoReturn
@@ -29,25 +29,10 @@ from vaneloop.base.errors import InputError, meant
 from vaneloop.base.files import write
 
 __all__ = [
-    "DEFECT",
-    "Parser",
-    "ReaderGone",
-    "add_output_options",
-    "clean",
-    "compiling",
-    "defect",
-    "input_of",
-    "is_terminal",
-    "keyboard",
-    "pairs",
-    "print_table",
-    "progress_bar",
-    "run",
-    "say",
-    "standard_streams",
-    "start",
+    "DEFECT", "Parser", "ReaderGone", "add_output_options", "clean", "compiling", "defect", "input_of", "is_terminal",
+    "keyboard", "notes", "pairs", "print_table", "progress_bar", "run", "say", "standard_streams", "start", "typed",
     "write_json",
-]
+]  # fmt: skip
 
 
 is_command = False  # this process is the command that a user typed, and no program that calls it
@@ -121,6 +106,17 @@ def say(args: argparse.Namespace, text: str) -> None:
     told_of_compiling = told_of_compiling or text.startswith("compiling")
     if not args.quiet:
         print(clean(text, lines=True), file=sys.stderr if args.json == "-" else sys.stdout, flush=True)
+
+
+def typed(name: str) -> str:
+    """The line with which the user asked the command ``name``."""
+    return " ".join([f"vaneloop {name}", *sys.argv[2:]])
+
+
+def notes(args: argparse.Namespace, texts: Iterable[str]) -> None:
+    """Tell the user what there is to note, a line each."""
+    for text in texts:
+        say(args, f"note: {text}")
 
 
 def compiling() -> None:

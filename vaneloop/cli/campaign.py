@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as Xml
 
@@ -90,7 +89,7 @@ def _command(args: argparse.Namespace) -> int:
     tell_damaged(args, folder.damaged)
     terminal.write_json(args, view.json())
     if args.report:
-        words = " ".join(["vaneloop campaign", *sys.argv[2:]])
+        words = terminal.typed("campaign")
         terminal.say(args, f"page: {campaign_page(view, words).write(args.report)}")
     if args.junit:
         _write_junit(args.junit, view)

@@ -37,6 +37,5 @@ def chain_of(args: argparse.Namespace, model: Any = None, loop: bool = False) ->
         warm_up(lambda text: terminal.say(args, text))
     tell_search(lambda text: terminal.say(args, text))
     chain = bind_parts(machine, log, *own_parts)
-    for note in chain.notes:
-        terminal.say(args, f"note: {note}")
+    terminal.notes(args, chain.notes)
     return chain

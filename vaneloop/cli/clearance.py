@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import asdict, replace
 
 from plant import load_geometry
@@ -103,8 +102,5 @@ def command(args: argparse.Namespace) -> int:
     unit = {"clearance": "mm", "width": "deg"}
     terminal.write_json(args, {"schema": 1, "unit": unit, "vane": args.vane, "stages": [asdict(s) for s in studies]})
     if args.report:
-        terminal.say(
-            args,
-            f"page: {clearance_page(studies, args.report, ' '.join(['vaneloop clearance', *sys.argv[2:]]), args.vane)}",
-        )
+        terminal.say(args, f"page: {clearance_page(studies, args.report, terminal.typed('clearance'), args.vane)}")
     return 0

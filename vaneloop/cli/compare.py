@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
 from hil.logs import LogError
 from vaneloop.base import terminal
@@ -79,7 +78,7 @@ def command(args: argparse.Namespace) -> int:
         extra["not_observed"] = chain.not_observed
         extra["verdict"] = "fails" if answer.fails else "agrees"
         if report:
-            words = " ".join(["vaneloop compare", *sys.argv[2:]])
+            words = terminal.typed("compare")
             terminal.say(args, f"page: {answer.report(report, words)}")
             report = None
     args.report = report
@@ -94,8 +93,5 @@ def _own(args: argparse.Namespace) -> int:
     answer = own_model.ask(args, "compare")
     own_model.show(args, answer.by_log)
     terminal.say(args, answer.sentence())
-    terminal.write_json(args, answer.to_dict())
-    if args.report:
-        words = " ".join(["vaneloop compare", *sys.argv[2:]])
-        terminal.say(args, f"page: {answer.report(args.report, words)}")
+    options.answered(args, "compare", answer)
     return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import Any
 
 from vaneloop.base import terminal
@@ -60,10 +59,7 @@ def command(args: argparse.Namespace) -> int:
             answer = diagnosed(chain, args.log, args.workers, news=news)
     show(args, answer)
     explain.show(args, {s.stage: (s.decisions, s.final.effects) for s in answer.diagnosis.stages})
-    terminal.write_json(args, answer.to_dict())
-    if args.report:
-        words = " ".join(["vaneloop diagnose", *sys.argv[2:]])
-        terminal.say(args, f"page: {answer.report(args.report, words)}")
+    options.answered(args, "diagnose", answer)
     return 0 if answer.verdict == "none" else 1
 
 
@@ -81,8 +77,7 @@ def show(args: argparse.Namespace, answer: Any) -> None:
     if answer.by_log is not None:
         own_model.show(args, answer.by_log)
     else:
-        for note in d.notes[len(answer.bound.notes) :]:
-            terminal.say(args, f"note: {note}")
+        terminal.notes(args, d.notes[len(answer.bound.notes) :])
     terminal.print_table(args, f"searched in {d.elapsed_s:.1f} s; errors are RMS on held-out data", columns, rows)
     options.say_tested(args, answer.tested)
     for s in d.stages:

@@ -100,8 +100,7 @@ def demand_of(args: argparse.Namespace, notes: list[str], default: str | None = 
 
     def tell(said: list[str]) -> None:
         notes.extend(said)
-        for note in said:
-            terminal.say(args, f"note: {note}")
+        terminal.notes(args, said)
 
     if args.log:
         log = options.read_log_of(args)

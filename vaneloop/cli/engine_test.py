@@ -5,7 +5,6 @@ curves.
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import Any
 
 from hil.engine_test import engine_test, load_profile
@@ -122,7 +121,7 @@ def command(args: argparse.Namespace) -> int:
     }
     terminal.write_json(args, out)
     if args.report:
-        words = " ".join(["vaneloop engine-test", *sys.argv[2:]])
+        words = terminal.typed("engine-test")
         page = engine_test_report(results["single"], dual, PAPER_TABLE_5, args.report, command=words)
         terminal.say(args, f"page: {page}")
     return 1 if exceeded else 0

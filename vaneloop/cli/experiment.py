@@ -82,8 +82,7 @@ def command(args: argparse.Namespace) -> int:
         else:
             print(f"vaneloop experiment: no profile separates the rivals; {args.out} is not written", file=sys.stderr)
     if args.report:
-        words = " ".join(["vaneloop experiment", *sys.argv[2:]])
-        terminal.say(args, f"page: {answer.report(args.report, words)}")
+        terminal.say(args, f"page: {answer.report(args.report, terminal.typed('experiment'))}")
     return 1 if e is not None and not e["separates"] else 0
 
 

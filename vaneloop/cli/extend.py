@@ -62,14 +62,13 @@ def command(args: argparse.Namespace) -> int:
     if answer.refused:
         print(f"vaneloop extend: {args.log}: {answer.refused}; {args.out} is not written", file=sys.stderr)
         return 1
-    answer = replace(answer, model=answer.model.noted(_words()), path=args.out)
+    answer = replace(answer, model=answer.model.noted(terminal.typed("extend")), path=args.out)
     answer.write(args.out)
     results = answer.diagnosis.stages
     if answer.by_log is not None:
         own_model.show(args, answer.by_log)
     else:
-        for note in answer.diagnosis.notes[len(answer.bound.notes) :]:
-            terminal.say(args, f"note: {note}")
+        terminal.notes(args, answer.diagnosis.notes[len(answer.bound.notes) :])
     rows = []
     for r in results:
         for k in range(len(r.floor)):
@@ -88,11 +87,5 @@ def command(args: argparse.Namespace) -> int:
         )
     terminal.say(args, answer.sentence())
     terminal.say(args, f"model: {args.out}")
-    terminal.write_json(args, answer.to_dict())
-    if args.report:
-        terminal.say(args, f"page: {answer.report(args.report, _words())}")
+    options.answered(args, "extend", answer)
     return 0 if answer.reached else 1
-
-
-def _words() -> str:
-    return " ".join(["vaneloop extend", *sys.argv[2:]])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -202,7 +201,7 @@ def _report(args: argparse.Namespace) -> int:
         pages = Path(args.report).with_suffix("")
         pages = pages.with_name(f"{pages.name}_logs")
         said = tables.answers(folder, view.keys())
-        words = " ".join(["vaneloop fleet", *sys.argv[2:]])
+        words = terminal.typed("fleet")
         page = fleet_page(view, words, pages.name if said else "").write(args.report)
         if said:
             report.write_pages(pages, said)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import Any
 
 from vaneloop.base import terminal
@@ -63,7 +62,6 @@ def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
     for path in filter(None, (args.out, args.python)):
         check(path)
-    words = " ".join(["vaneloop learn", *sys.argv[2:]])
     checked_shape(args.shape)
     own, asked = own_model.asked(args), {"shape": args.shape, "formulas": not args.curve}
     chain: Any = None if own else not_given(chain_of(args), args.without)
@@ -73,7 +71,7 @@ def command(args: argparse.Namespace) -> int:
         else:
             answer = learned(chain, args.log, options.machine_of(args).added, progress=tell, **asked)
     if answer.model is not None and args.out:
-        answer = with_path(answer, args.out, words)
+        answer = with_path(answer, args.out, terminal.typed("learn"))
     if answer.by_log is not None:
         own_model.show(args, answer.by_log)
     for law in answer.laws:
@@ -85,17 +83,14 @@ def command(args: argparse.Namespace) -> int:
         for f in law.formulas:
             name = f", {f.law} of the library" if f.law else ""
             terminal.say(args, f"formula: {f.text}{name}; held-out error {f.error:.3g} noise floors")
-    for note in answer.notes:
-        terminal.say(args, f"note: {note}")
+    terminal.notes(args, answer.notes)
     if answer.outcome.nearest and not answer.laws:
         terminal.say(args, f"nearest: {', '.join(answer.outcome.nearest)}")
     explain.show(args, answer.explained)
     terminal.say(args, answer.sentence())
     if answer.path:
         terminal.say(args, f"law: {answer.path}")
-    terminal.write_json(args, answer.to_dict())
-    if args.report:
-        terminal.say(args, f"page: {answer.report(args.report, words)}")
+    options.answered(args, "learn", answer)
     if args.python and answer.laws:
         answer.write_python(args.python, own_model.system_of(args) if own else None)
         terminal.say(args, f"law in Python: {args.python}")

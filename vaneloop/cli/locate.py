@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
 from vaneloop.base import terminal
 from vaneloop.cli import options, own_model
@@ -48,8 +47,5 @@ def command(args: argparse.Namespace) -> int:
         say_located(args, x)
     for f in answer.held.failing if answer.held else ():
         terminal.say(args, str(f))
-    terminal.write_json(args, answer.to_dict())
-    if args.report:
-        words = " ".join(["vaneloop locate", *sys.argv[2:]])
-        terminal.say(args, f"page: {answer.report(args.report, words)}")
+    options.answered(args, "locate", answer)
     return 1 if answer.fails else 0

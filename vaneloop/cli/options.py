@@ -21,27 +21,11 @@ from vaneloop.base.errors import InputError
 from vaneloop.verbs.machine import TABLES, Machine, files_of
 
 __all__ = [
-    "A_LOG",
-    "add_controller_options",
-    "add_log_options",
-    "add_machine_options",
-    "add_plant_option",
-    "add_reading_options",
-    "add_tables_option",
-    "add_trust_option",
-    "add_without_option",
-    "guarded",
-    "log_options",
-    "machine_of",
-    "parts_to_test",
-    "read_log_of",
-    "say_located",
-    "say_tested",
-    "search_bar",
-    "tables_of",
-    "trusted",
-    "warm_up_for",
-]
+    "A_LOG", "add_controller_options", "add_log_options", "add_machine_options", "add_plant_option",
+    "add_reading_options", "add_tables_option", "add_trust_option", "add_without_option", "answered", "guarded",
+    "log_options", "machine_of", "parts_to_test", "read_log_of", "say_located", "say_tested", "search_bar",
+    "tables_of", "trusted", "warm_up_for",
+]  # fmt: skip
 
 A_LOG = f"{listed(OURS)}, or the format of a package (docs/logs.md)"
 
@@ -66,6 +50,13 @@ def search_bar(args: argparse.Namespace) -> Iterator[Callable[[Any], None] | Non
 def parts_to_test(args: argparse.Namespace) -> list[str]:
     """What ``--test`` names: parts of the log; with ``--system`` also logs."""
     return [name for group in getattr(args, "test", ()) for name in group]
+
+
+def answered(args: argparse.Namespace, name: str, answer: Any) -> None:
+    """Write the JSON and the page of an answer that the command ``name`` gives, where they are asked for."""
+    terminal.write_json(args, answer.to_dict())
+    if args.report:
+        terminal.say(args, f"page: {answer.report(args.report, terminal.typed(name))}")
 
 
 def say_tested(args: argparse.Namespace, rows: Any) -> None:

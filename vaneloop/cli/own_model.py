@@ -101,8 +101,7 @@ def logs_of(args: argparse.Namespace, system: System) -> tuple[list[Any], list[A
 def _record(args: argparse.Namespace, system: Any, path: str) -> Any:
     """One log as the system wants it: by its own reader, or by ours."""
     record, notes = read_record(path, system, **({} if system.read else options.log_options(args)))
-    for note in notes:
-        terminal.say(args, f"note: {note}")
+    terminal.notes(args, notes)
     return record
 
 
@@ -110,8 +109,7 @@ def show(args: argparse.Namespace, by_log: Any) -> None:
     """Print what is to note, each log's error after each step, and the model's own parameters."""
     d = by_log.d
     said = {n for logs in (by_log.logs.fitted, by_log.logs.test) if logs for r in logs.data.records for n in r.notes}
-    for note in (n for n in by_log.notes if n not in said):  # those were said when the log was read
-        terminal.say(args, f"note: {note}")
+    terminal.notes(args, (n for n in by_log.notes if n not in said))  # those were said when the log was read
     short = short_names(list(next(iter(by_log.steps.values()))))
     rows = []
     for log, what, k, errors, size in by_log.rows():

@@ -122,8 +122,7 @@ def replayed(
     terminal.print_table(
         args, f"{result.log}: {result.simulated_s:,.0f} s simulated in {result.wall_s:.2f} s", columns, rows
     )
-    for note in (n for n in result.notes if n not in said):
-        terminal.say(args, f"note: {note}")
+    terminal.notes(args, (n for n in result.notes if n not in said))
     for line in exceeded:
         terminal.say(args, f"differs: {line}")
     notes = list(dict.fromkeys([*said, *result.notes]))

@@ -155,8 +155,7 @@ def _node(args: argparse.Namespace, machine: Any = None) -> Any:
     if args.plant_fmu is not None:
         mapping = terminal.pairs(args.plant_map, "plant-map")
         fmu = PlantFmu(args.plant_fmu, machine.plant.vanes, mapping, n_r=args.start_speed)
-        for note in fmu.notes:
-            terminal.say(args, f"note: {note}")
+        terminal.notes(args, fmu.notes)
         return PlantNode(fmu, machine.plant, machine.calibration, n_r=args.start_speed, seed=args.seed)
     return Node(machine.plant, machine.calibration, n_r=args.start_speed, seed=args.seed)
 
@@ -249,8 +248,7 @@ def _in_real_time(args: argparse.Namespace, name: str) -> int:
                     )  # fmt: skip
             finally:
                 live.close()
-    for note in notes:
-        terminal.say(args, f"note: {note}")
+    terminal.notes(args, notes)
     terminal.say(args, f"{report.ticks / 1000:,.3f} s on {name}{f', ended by {report.ended}' if report.ended else ''}")
     station.print_lateness(args, report)
     terminal.say(

@@ -5,7 +5,6 @@ remain.
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import Any
 
 from plant import load_geometry, load_schedules
@@ -160,13 +159,10 @@ def command(args: argparse.Namespace) -> int:
         ]
         columns += ["extension, mm", "retraction"]
         terminal.print_table(args, f"measured in {result.log}", columns, rows)
-    for note in result.notes:
-        terminal.say(args, f"note: {note}")
+    terminal.notes(args, result.notes)
     if args.out:
         terminal.say(args, "tables: " + ", ".join(str(p) for p in write_tables(result, args.out)))
     terminal.write_json(args, result_json(result))
     if args.report:
-        terminal.say(
-            args, f"page: {schedule_page(result, args.report, ' '.join(['vaneloop schedule', *sys.argv[2:]]))}"
-        )
+        terminal.say(args, f"page: {schedule_page(result, args.report, terminal.typed('schedule'))}")
     return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
 import numpy as np
 
@@ -76,8 +75,7 @@ def command(args: argparse.Namespace) -> int:
     terminal.print_table(
         args, f"{len(check.stroke)} strokes from 0 to 48 mm, axial offset {args.offset:g} mm", columns, rows
     )
-    for note in check.notes:
-        terminal.say(args, f"note: {note}")
+    terminal.notes(args, check.notes)
     exceeded = [
         f"{s['stage']} {s['max_abs']:.4f} deg exceeds {args.limit:g} deg" for s in stages if s["max_abs"] > args.limit
     ]
@@ -93,5 +91,5 @@ def command(args: argparse.Namespace) -> int:
     }
     terminal.write_json(args, out)
     if args.report:
-        terminal.say(args, f"page: {spatial_page(check, args.report, ' '.join(['vaneloop spatial', *sys.argv[2:]]))}")
+        terminal.say(args, f"page: {spatial_page(check, args.report, terminal.typed('spatial'))}")
     return 1 if exceeded else 0

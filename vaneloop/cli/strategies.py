@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
@@ -138,7 +137,7 @@ def command(args: argparse.Namespace) -> int:
         },
     )  # fmt: skip
     if args.report:
-        words = " ".join(["vaneloop strategies", *sys.argv[2:]])
+        words = terminal.typed("strategies")
         page = report(args.report, rows, plant, outcomes, failures, goals, best, words)
         terminal.say(args, f"page: {page}")
     return 1 if missed else 0

@@ -22,13 +22,8 @@ from vaneloop.design.scheduling import ScheduleResult
 from vaneloop.design.stroke_tables import vane_angle_table
 
 __all__ = [
-    "result_json",
-    "write_geometry",
-    "write_schedules",
-    "write_stroke_tables",
-    "write_tables",
-    "write_vane_angles",
-]
+    "result_json", "write_geometry", "write_schedules", "write_stroke_tables", "write_tables", "write_vane_angles",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 LOOP_FIGURES = (

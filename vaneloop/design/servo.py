@@ -38,20 +38,9 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.tables import read
 
 __all__ = [
-    "Corner",
-    "Gains",
-    "Margins",
-    "ServoPlant",
-    "analyse",
-    "continuous_loop",
-    "continuous_response",
-    "default_gains",
-    "frequency_grid",
-    "frequency_response",
-    "margins",
-    "noise_current",
-    "sampled_loop",
-]
+    "Corner", "Gains", "Margins", "ServoPlant", "analyse", "continuous_loop", "continuous_response", "default_gains",
+    "frequency_grid", "frequency_response", "margins", "noise_current", "sampled_loop",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -35,16 +35,8 @@ from vaneloop.design.servo_motor import plant_of_tables
 from vaneloop.design.servo_simulation import ramp_demand, simulate, steady_cycle
 
 __all__ = [
-    "BACKLASH_INSIDE",
-    "MIDDLE",
-    "Check",
-    "DesignResult",
-    "Limits",
-    "PlayFigures",
-    "design",
-    "evaluate",
-    "summary",
-]
+    "BACKLASH_INSIDE", "MIDDLE", "Check", "DesignResult", "Limits", "PlayFigures", "design", "evaluate", "summary",
+]  # fmt: skip
 
 Complex = NDArray[np.complex128]
 BACKLASH_INSIDE = 0.02e-3  # m: a rod end in good order, between piston and LVDT

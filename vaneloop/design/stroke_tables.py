@@ -19,15 +19,9 @@ from plant.linkage import STROKE_HIGH, STROKE_LOW, stage_vane_angle
 from vaneloop.base.errors import InputError
 
 __all__ = [
-    "DESIGN_SPEED",
-    "STROKE_LIMITS",
-    "refuse_outside",
-    "schedules_at_design",
-    "stroke_of_model",
-    "stroke_tables",
-    "table_speeds",
-    "vane_angle_table",
-]
+    "DESIGN_SPEED", "STROKE_LIMITS", "refuse_outside", "schedules_at_design", "stroke_of_model", "stroke_tables",
+    "table_speeds", "vane_angle_table",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 DESIGN_SPEED = 100.0  # %

@@ -34,17 +34,9 @@ from vaneloop.base.compiled import in_place
 from vaneloop.base.errors import InputError
 
 __all__ = [
-    "TrendDesign",
-    "TrendModel",
-    "direction",
-    "false_turns_per_hour",
-    "filterpy_estimates",
-    "filterpy_gain",
-    "firmware_estimates",
-    "recommend",
-    "riccati_gain",
-    "tracking_index_gain",
-]
+    "TrendDesign", "TrendModel", "direction", "false_turns_per_hour", "filterpy_estimates", "filterpy_gain",
+    "firmware_estimates", "recommend", "riccati_gain", "tracking_index_gain",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 

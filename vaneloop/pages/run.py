@@ -18,17 +18,9 @@ from vaneloop.pages.page import Page
 from vaneloop.pages.series import break_at_holes
 
 __all__ = [
-    "NAMES",
-    "ZOOM",
-    "Channel",
-    "Result",
-    "against_speed",
-    "axis_title",
-    "loops",
-    "rotor_speed",
-    "signal_name",
+    "NAMES", "ZOOM", "Channel", "Result", "against_speed", "axis_title", "loops", "rotor_speed", "signal_name",
     "speed_lines",
-]
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 NAMES = {

@@ -19,7 +19,7 @@ from vaneloop.pages.figures import Line, Panel, bars, loop, overlay
 from vaneloop.pages.page import Page
 from vaneloop.pages.style import STAGE_ROLES
 
-__all__ = ["mechanism_figure", "schedule_page"]
+__all__ = ["mechanism_figure", "schedule_page", "with_points"]
 
 NAMES = {v: v.upper() for v in VANES}
 
@@ -168,13 +168,13 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
             Line("extension", g, m.extension[inside], "measured", 2.0),
             Line("retraction", g, m.retraction[inside], "model", 2.0),
         ]
-        page.plot(_with_points(points, curves, "vane angle [deg]"), "Angle against stroke.")
+        page.plot(with_points(points, curves, "vane angle [deg]"), "Angle against stroke.")
         points = [
             Line(p.name, p.x, np.asarray(p.y) - np.interp(np.asarray(p.x), m.stroke, base), p.role) for p in points
         ]
         curves = [Line(c.name, c.x, np.asarray(c.y) - base[inside], c.role, c.width) for c in curves]
         caption = "The same less the geometry's own curve: the gap is seen by itself."
-        page.plot(_with_points(points, curves, "angle less model as entered [deg]"), caption)
+        page.plot(with_points(points, curves, "angle less model as entered [deg]"), caption)
 
     page.section(
         "Stroke tables",
@@ -199,14 +199,11 @@ def schedule_page(result: ScheduleResult, path: str | Path, command: str = "") -
     return page.write(path)
 
 
-def _with_points(points: list[Line], curves: list[Line], y_title: str) -> dict[str, Any]:
-    """Measured samples as dots, curves as lines."""
+def with_points(points: list[Line], curves: list[Line], y_title: str) -> dict[str, Any]:
+    """Measured samples over the stroke as dots, curves as lines."""
     figure = loop([*points, *curves], "stroke [mm]", y_title, height=480)
     for trace, line in zip(figure["data"][: len(points)], points, strict=True):
-        trace |= {
-            "mode": "markers",
-            "x": np.round(np.asarray(line.x), 4).tolist(),
-            "y": np.round(np.asarray(line.y), 4).tolist(),
-        }
+        x, y = (np.round(np.asarray(v), 4).tolist() for v in (line.x, line.y))
+        trace |= {"mode": "markers", "x": x, "y": y}
         trace["marker"] |= {"size": 3, "opacity": 0.5}
     return figure

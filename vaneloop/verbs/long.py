@@ -31,17 +31,8 @@ if TYPE_CHECKING:
     from vaneloop.identification.vane_chain.resample import Grid
 
 __all__ = [
-    "LONG",
-    "Held",
-    "Whole",
-    "carried",
-    "changed",
-    "excerpted",
-    "held_against",
-    "held_results",
-    "located",
-    "searched",
-]
+    "LONG", "Held", "Whole", "carried", "changed", "excerpted", "held_against", "held_results", "located", "searched",
+]  # fmt: skip
 
 LONG = 360_000  # rows, an hour at 100 Hz; a log with more is fitted on an excerpt
 FITTED = 120_000  # rows of an excerpt, half of them evenly spaced: three times what a stage is searched on

@@ -28,17 +28,9 @@ if TYPE_CHECKING:
     from vaneloop.verbs.replay import LogLike
 
 __all__ = [
-    "LogsLike",
-    "Parts",
-    "Tested",
-    "bind_parts",
-    "part_of",
-    "read_record",
-    "records_of",
-    "signals_of",
-    "split",
+    "LogsLike", "Parts", "Tested", "bind_parts", "part_of", "read_record", "records_of", "signals_of", "split",
     "tested",
-]
+]  # fmt: skip
 
 Part: TypeAlias = "tuple[float | None, float | None] | str"  # of a log: from, to in s; None an open end
 Parts: TypeAlias = "Part | Sequence[Part]"

@@ -26,24 +26,9 @@ from vaneloop.pages.series import break_at_holes
 from vaneloop.pages.style import THEMES
 
 __all__ = [
-    "OVER",
-    "Band",
-    "Chart",
-    "Curves",
-    "Figure",
-    "Mark",
-    "Over",
-    "Panel",
-    "Trace",
-    "bands",
-    "figure",
-    "mode_bands",
-    "of_log",
-    "of_stage",
-    "painted",
-    "thinned",
-    "view",
-]
+    "OVER", "Band", "Chart", "Curves", "Figure", "Mark", "Over", "Panel", "Trace", "bands", "figure", "mode_bands",
+    "of_log", "of_stage", "painted", "thinned", "view",
+]  # fmt: skip
 
 Array = np.ndarray
 MOST_BANDS = 400

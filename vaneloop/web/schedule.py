@@ -19,8 +19,8 @@ from vaneloop.base.signals import heading
 from vaneloop.design.links import CRITERIA
 from vaneloop.design.schedule_files import write_geometry, write_schedules
 from vaneloop.design.stroke_tables import STROKE_LIMITS
-from vaneloop.pages.figures import Line, Panel, loop, overlay
-from vaneloop.pages.schedule import NAMES
+from vaneloop.pages.figures import Line, Panel, overlay
+from vaneloop.pages.schedule import NAMES, with_points
 from vaneloop.pages.style import STAGE_ROLES
 from vaneloop.verbs.machine import files_of
 from vaneloop.web.chosen_log import receive, suffixes
@@ -448,15 +448,7 @@ class _Page:
                     if (side == k).any()
                 ]
                 curves = [Line(n, g, getattr(m, n)[inside] - mean(g), role, 2.0) for n, _, role in groups[:2]]
-                f = loop([*dots, *curves], "stroke [mm]", title)
-                for trace, line in zip(f["data"][: len(dots)], dots, strict=True):
-                    trace |= {
-                        "mode": "markers",
-                        "x": np.round(np.asarray(line.x), 4).tolist(),
-                        "y": np.round(np.asarray(line.y), 4).tolist(),
-                    }
-                    trace["marker"] |= {"size": 3, "opacity": 0.45}
-                figure_of(f, dark(self.s), 380)
+                figure_of(with_points(dots, curves, title), dark(self.s), 380)
         notes_of(self.s, "What was done to the log", r.notes)
 
     def _tables(self, answer: dict[str, Any]) -> None:

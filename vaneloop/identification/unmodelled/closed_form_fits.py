@@ -46,17 +46,9 @@ from vaneloop.identification.user_models.simulation import Placed
 from vaneloop.identification.user_models.terms import runs
 
 __all__ = [
-    "Product",
-    "effect_of",
-    "fitted_formulas",
-    "fitted_product",
-    "fitted_products",
-    "goes_on",
-    "library_name",
-    "likely",
-    "likely_products",
-    "reach_of",
-]
+    "Product", "effect_of", "fitted_formulas", "fitted_product", "fitted_products", "goes_on", "library_name", "likely",
+    "likely_products", "reach_of",
+]  # fmt: skip
 
 STRAIGHT = ("constant", "line", "straight line")
 DEGREES = ("degC", "°C", "C")

@@ -38,15 +38,9 @@ from vaneloop.identification.user_models.system import System
 from vaneloop.identification.user_models.terms import COLUMN, INPUT, OUTPUT, Curve, Jump, Surface, Table
 
 __all__ = [
-    "Candidate",
-    "SurfaceCandidate",
-    "UserModelCandidates",
-    "candidates",
-    "may_be_of",
-    "on_logs",
-    "surface_of",
+    "Candidate", "SurfaceCandidate", "UserModelCandidates", "candidates", "may_be_of", "on_logs", "surface_of",
     "with_curves",
-]
+]  # fmt: skip
 
 JUMP = -1  # of a curve's amplitudes, the one that is of no function of its basis
 

@@ -39,19 +39,9 @@ from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.user_models.exogenous_regressors import swings
 
 __all__ = [
-    "all_in_their_place",
-    "another_confirms",
-    "at_its_place",
-    "better_than",
-    "earning_by_formula",
-    "harmless",
-    "instead_of",
-    "leaves",
-    "moves",
-    "said_first",
-    "stands_before",
-    "without_memory",
-]
+    "all_in_their_place", "another_confirms", "at_its_place", "better_than", "earning_by_formula", "harmless",
+    "instead_of", "leaves", "moves", "said_first", "stands_before", "without_memory",
+]  # fmt: skip
 
 
 def in_its_place(ground: CandidateSource, tried: FittedCandidate) -> list[FittedCandidate]:

@@ -20,27 +20,10 @@ from vaneloop.identification.user_models.exogenous_regressors import DISTANCE, S
 from vaneloop.identification.user_models.simulation import Placed
 
 __all__ = [
-    "MEASURED",
-    "Blocks",
-    "CandidateSource",
-    "FittedCandidate",
-    "Outcome",
-    "Placings",
-    "adds_what",
-    "at_samples",
-    "channel_of",
-    "held_out",
-    "left_by_its_mean",
-    "one_constant",
-    "plain",
-    "stands",
-    "step_without",
-    "strange",
-    "surely_more",
-    "told_by_others",
-    "with_held_out",
-    "without_its_lag",
-]
+    "MEASURED", "Blocks", "CandidateSource", "FittedCandidate", "Outcome", "Placings", "adds_what", "at_samples",
+    "channel_of", "held_out", "left_by_its_mean", "one_constant", "plain", "stands", "step_without", "strange",
+    "surely_more", "told_by_others", "with_held_out", "without_its_lag",
+]  # fmt: skip
 
 Placings = tuple[tuple[Placed, Effect], ...]
 MEASURED = 2  # up to here what is `strange` is of measured or simulated channels alone, as they are

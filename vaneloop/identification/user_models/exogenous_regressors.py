@@ -18,24 +18,9 @@ from vaneloop.identification.user_models.motion import smoothed
 from vaneloop.identification.user_models.system import Record
 
 __all__ = [
-    "DISTANCE",
-    "MINUS",
-    "SINCE",
-    "STOPS",
-    "TIME",
-    "WAY",
-    "column_of",
-    "every",
-    "forgotten",
-    "is_memory",
-    "lagged",
-    "lagged_name",
-    "named_lag",
-    "of_stops",
-    "share_given_back",
-    "sides_of",
-    "swings",
-]
+    "DISTANCE", "MINUS", "SINCE", "STOPS", "TIME", "WAY", "column_of", "every", "forgotten", "is_memory", "lagged",
+    "lagged_name", "named_lag", "of_stops", "share_given_back", "sides_of", "swings",
+]  # fmt: skip
 
 TIME = "time"
 MINUS = "_minus_"

@@ -30,21 +30,9 @@ from vaneloop.identification.user_models.data import Data
 from vaneloop.identification.user_models.exogenous_regressors import MINUS, STOPS, of_stops
 
 __all__ = [
-    "COLUMN",
-    "HOW",
-    "INPUT",
-    "OUTPUT",
-    "SENSED",
-    "Curve",
-    "Jump",
-    "Surface",
-    "Table",
-    "apart",
-    "bent",
-    "curves_for_kernel",
-    "runs",
-    "surfaces_for_kernel",
-]
+    "COLUMN", "HOW", "INPUT", "OUTPUT", "SENSED", "Curve", "Jump", "Surface", "Table", "apart", "bent",
+    "curves_for_kernel", "runs", "surfaces_for_kernel",
+]  # fmt: skip
 
 INPUT, OUTPUT, COLUMN = 100, 200, 300  # numbers of quantities: states are below
 NOTHING = -1  # in the place of one that would be taken off

@@ -46,16 +46,9 @@ from vaneloop.identification.vane_chain.parameters import ALL_PLACES
 from vaneloop.identification.vane_chain.subsystem_data import Driven, Made
 
 __all__ = [
-    "OF_STROKE",
-    "SCALE",
-    "VaneChainCandidates",
-    "curve_effect",
-    "remade",
-    "reversals",
-    "room_for",
-    "with_laws",
+    "OF_STROKE", "SCALE", "VaneChainCandidates", "curve_effect", "remade", "reversals", "room_for", "with_laws",
     "without_laws",
-]
+]  # fmt: skip
 
 SCALE = "scale"  # of a law from a file
 LOG, REST, TEST = "log", "rest of the log", "test"
