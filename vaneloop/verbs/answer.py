@@ -20,7 +20,7 @@ from vaneloop.base.notebook import html_table
 from vaneloop.base.signals import heading
 from vaneloop.pages.story import verdict_word
 from vaneloop.pages.style import THEMES, painted
-from vaneloop.verbs.curves import Curves, curves_of_stages
+from vaneloop.verbs.curves import Curves, curves_of_logs, curves_of_stages
 from vaneloop.verbs.estimates import Correlation, Fitted, Parameters, correlation_of, parameters_of
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from pandas import DataFrame
 
+    from vaneloop.identification.user_models.by_log import ByLog
     from vaneloop.pages.page import Page
 
 __all__ = ["Answer", "Row", "WholePage"]
@@ -64,6 +65,7 @@ class Answer:
     """
 
     log: str
+    by_log: ByLog | None = None  # of a user's own system: what the answer means log by log
 
     def sentence(self) -> str:
         """The answer in one sentence."""
@@ -86,7 +88,10 @@ class Answer:
         return ()
 
     def _worked_out(self) -> Curves:
-        return curves_of_stages(self._fits(), self.log)
+        if self.by_log is None:
+            return curves_of_stages(self._fits(), self.log)
+        d = self.by_log.d
+        return curves_of_logs(self.by_log.logs, d.final.theta, d.base.theta, self.log)
 
     @cached_property
     def _curves(self) -> Curves:

@@ -35,7 +35,7 @@ from vaneloop.pages.learned import learned_page
 from vaneloop.pages.story import floors
 from vaneloop.pages.style import capital
 from vaneloop.verbs.answer import COLOUR, Answer, Row, axes, labelled
-from vaneloop.verbs.curves import Curves, curves_of_logs
+from vaneloop.verbs.curves import Curves
 from vaneloop.verbs.estimates import Fitted
 from vaneloop.verbs.machine import Machine
 from vaneloop.verbs.search import Diagnosed, chain_for, diagnose, not_given, with_fits
@@ -128,10 +128,7 @@ class Learned(Answer):
         return [*self.fits, *(f for f in self.diagnosed._fits() if f.judge.stage.name not in learned)]
 
     def _worked_out(self) -> Curves:
-        if self.by_log is None:
-            return super()._worked_out() if self.fits else self.diagnosed._curves
-        d = self.by_log.d
-        return curves_of_logs(self.by_log.logs, d.final.theta, d.base.theta, self.log)
+        return super()._worked_out() if self.by_log is not None or self.fits else self.diagnosed._curves
 
     def plot(self, ax: Axes | None = None, *, signal: str = "", residuals: bool = False) -> Axes:
         """Draw the first law over its quantity, with its 90 % band; with a signal, or where none was learned, as of

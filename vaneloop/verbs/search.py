@@ -51,7 +51,7 @@ from vaneloop.pages.diagnosis import (
 )
 from vaneloop.pages.story import CANNOT, EXPLAINED, MISSING, extended_sentence, reached, since
 from vaneloop.verbs.answer import COLOUR, Answer, Row, axes, labelled
-from vaneloop.verbs.curves import Curves, curves_of_logs
+from vaneloop.verbs.curves import Curves
 from vaneloop.verbs.estimates import Fitted
 from vaneloop.verbs.long import Held, changed, held_results, searched
 from vaneloop.verbs.long import located as located_of
@@ -139,12 +139,6 @@ class Stages(Answer):
     def _fits(self) -> list[Fitted]:
         return [_fitted(self.bound, x.stage, x.floor, x.fit, x.fit) for x in self.located]
 
-    def _worked_out(self) -> Curves:
-        if self.by_log is None:
-            return super()._worked_out()
-        theta = self.located[0].fit.theta
-        return curves_of_logs(self.by_log.logs, theta, theta, self.log)
-
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
         title = "Where the model fails" if self.verb == "locate" else "Model and log"
@@ -209,12 +203,6 @@ class Diagnosed(Answer):
 
     def _fits(self) -> list[Fitted]:
         return [_fitted(self.bound, s.stage, s.floor, s.final, s.base) for s in self.diagnosis.stages]
-
-    def _worked_out(self) -> Curves:
-        if self.by_log is None:
-            return super()._worked_out()
-        d = self.by_log.d
-        return curves_of_logs(self.by_log.logs, d.final.theta, d.base.theta, self.log)
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
@@ -340,16 +328,8 @@ class Experiment(Answer):
 
     def page(self, command: str = "") -> Page:
         """The answer as a page."""
-        d = self.diagnosed
-        return experiment_page(
-            d.diagnosis,
-            d.bound,
-            command,
-            self.log,
-            self.sentence(),
-            cast("dict[str, Any] | None", self.recommended),
-            d.by_log,
-        )
+        d, run = self.diagnosed, cast("dict[str, Any] | None", self.recommended)
+        return experiment_page(d.diagnosis, d.bound, command, self.log, self.sentence(), run, d.by_log)
 
 
 def _fitted(bound: Bound, name: str, floor: Array, fit: Fit, base: Fit) -> Fitted:
@@ -584,16 +564,16 @@ def diagnosed(
         d, held = search(chain.stages, chain.not_observed, progress, workers, news=news), None
     else:
         chain, d, held = searched(chain, workers, progress, news)
-    d.notes = [*chain.notes, *(map(str, held.failing) if held else ()), *_at_limit(d.stages)]
-    _in_time_of_log(d.stages, chain)
+    d.notes = _noted(chain, d.stages, held)
     return Diagnosed(chain, d, log, held=held)
 
 
-def _in_time_of_log(stages: Sequence[StageDiagnosis], chain: Chain) -> None:
-    """Tell onsets in the log's own time; a chain's begins at 0."""
+def _noted(chain: Chain, stages: Sequence[StageDiagnosis], held: Held | None) -> list[str]:
+    """What there is to note. Onsets are told in the log's own time from now on; a chain's begins at 0."""
     for s in stages:
         if s.onset is not None:
             s.onset = Onset(*(v + chain.start for v in (s.onset.value, s.onset.low, s.onset.high)))
+    return [*chain.notes, *(map(str, held.failing) if held else ()), *_at_limit(stages)]
 
 
 def _at_limit(stages: Sequence[StageDiagnosis]) -> list[str]:
@@ -738,8 +718,7 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
     held = None
     if chain.whole is not None:
         results, held = held_results(bound, results)
-    notes = [*chain.notes, *(map(str, held.failing) if held else ()), *_at_limit(results)]
-    _in_time_of_log(results, chain)
+    notes = _noted(chain, results, held)
     notes += [f"{r.stage}: effects {since(r)}; the model has them all along" for r in results if r.onset is not None]
     d = Diagnosis("missing", results, {}, chain.not_observed, seconds, notes)
     return Extended(bound, d, log, None, model, next(filter(None, map(no_better, results)), ""), held=held)
