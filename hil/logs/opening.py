@@ -24,7 +24,7 @@ from hil.logs.units import NO_UNIT, USUAL_UNITS, Units, factor_of, scale_of
 from vaneloop.base.errors import meant
 from vaneloop.base.signals import UNITS
 
-__all__ = ["Opened", "is_ours", "open_log", "sketch", "wanted_design_speed"]
+__all__ = ["Opened", "is_ours", "open_log", "sketch", "times_of", "wanted_design_speed"]
 
 
 def is_ours(name: str, signals: Mapping[str, str]) -> bool:
@@ -208,15 +208,20 @@ def _guess_time(path: Path, out: Opened) -> None:
     source = out.source
     if not isinstance(source, Table) or source.time_unit or "t" in out.units:
         return
-    try:
-        t = source.times()
-    except LogError as e:
-        raise e if str(e).startswith(str(path)) else LogError(f"{path}: {e}") from None
+    t = times_of(path, source)
     unit, why = guess_unit(t[np.isfinite(t)])
     if unit:
         out.units["t"] = unit
         said = f"t ({source.time}): guessed to be in {unit} ({why}); --unit t=UNIT states another, --no-guess none"
         out.notes.append(Note(said, "guessed", "t", 1))
+
+
+def times_of(path: Path, table: Table) -> np.ndarray:
+    """The time column of a table, float64[rows]. Raises LogError, one line that names the file."""
+    try:
+        return table.times()
+    except LogError as e:
+        raise e if str(e).startswith(str(path)) else LogError(f"{path}: {e}") from None
 
 
 def sketch(path: Path, out: Opened, signals: Mapping[str, str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:

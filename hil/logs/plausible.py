@@ -10,7 +10,7 @@ the user's page.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -313,7 +313,7 @@ def unit_of_time(t: np.ndarray) -> str:
     return min(CLOCKS, key=lambda unit: abs(np.log(step * CLOCKS[unit] / USUAL_STEP)))
 
 
-def span_complaint(times: list[np.ndarray], number: Callable[[float], str] = "{:,.6g}".format) -> str:
+def span_complaint(times: list[np.ndarray]) -> str:
     """Why channels with these times (s, rising) span more than their rows are worth; "" where they do not."""
     span = max(float(t[-1]) for t in times) - min(float(t[0]) for t in times)
     rows = max(t.size for t in times)
@@ -321,6 +321,6 @@ def span_complaint(times: list[np.ndarray], number: Callable[[float], str] = "{:
     if span <= most:
         return ""
     return (
-        f"spans {number(span)} s with {rows:,} rows; allowed: up to {number(most)} s ({SLOWEST:g} s a row, "
-        f"{number(LONGEST)} s in all)"
+        f"spans {span:,.6g} s with {rows:,} rows; allowed: up to {most:,.6g} s ({SLOWEST:g} s a row, {LONGEST:,.6g} s "
+        f"in all)"
     )

@@ -15,7 +15,7 @@ from hil.logs.guess import Files
 from hil.logs.log import read_log
 from hil.logs.mapping import Bench
 from hil.logs.notes import told
-from hil.logs.opening import open_log, wanted_design_speed
+from hil.logs.opening import open_log, times_of, wanted_design_speed
 from hil.logs.source import LogError, find
 from hil.logs.table import Table
 from vaneloop.base.errors import InputError
@@ -166,10 +166,7 @@ def survey(
 
 def _time(path: Path, table: Table, units: Mapping[str, str], stated: set[str]) -> Row:
     """The row of a table's time column."""
-    try:
-        t = table.times()
-    except LogError as e:
-        raise e if str(e).startswith(str(path)) else LogError(f"{path}: {e}") from None
+    t = times_of(path, table)
     unit = units.get("t") or table.time_unit or "s"
     how = "guessed" if table.guessed or ("t" in units and "t" not in stated) else "named"
     if table.time in stated:

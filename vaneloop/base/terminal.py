@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import math
 import os
 import re
 import select
@@ -30,8 +31,8 @@ from vaneloop.base.files import write
 
 __all__ = [
     "DEFECT", "Parser", "ReaderGone", "add_output_options", "clean", "compiling", "defect", "input_of", "is_terminal",
-    "keyboard", "notes", "pairs", "print_table", "progress_bar", "run", "say", "standard_streams", "start", "typed",
-    "write_json",
+    "keyboard", "notes", "number", "pairs", "print_table", "progress_bar", "run", "say", "standard_streams", "start",
+    "typed", "write_json",
 ]  # fmt: skip
 
 
@@ -84,6 +85,14 @@ def pairs(
         if before != value.strip():
             raise InputError(f"--{name} {option!r}: {key.strip()!r} has been given {before!r} before; allowed: once")
     return out
+
+
+def number(text: str) -> float:
+    """The number that a text is; NaN where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 _CONTROL = {c: f"\\x{c:02x}" for c in (*range(0x20), *range(0x7F, 0xA0))} | {

@@ -75,10 +75,7 @@ def command(args: argparse.Namespace) -> int:
     vanes = geometry.vanes
     widths = {s: geometry.stage(s).hysteresis.value for s in vanes}
     for stage, text in terminal.pairs(args.width, "width", lambda k: k in vanes, ", ".join(vanes)).items():
-        try:
-            widths[stage] = float(text)
-        except ValueError:
-            widths[stage] = float("nan")
+        widths[stage] = terminal.number(text)
         if not 0.0 <= widths[stage] <= 10.0:
             raise InputError(f"--width {stage}={text}: must be a number in [0, 10] deg")
     studies = []

@@ -116,10 +116,7 @@ def _limits(args: argparse.Namespace) -> Limits:
 
 
 def _above_zero(option: str, shown: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
+    value = terminal.number(text)
     if not (np.isfinite(value) and value > 0.0):
         raise InputError(f"--{option} {shown}: must be a number above 0")
     return value

@@ -68,12 +68,12 @@ def say_tested(args: argparse.Namespace, rows: Any) -> None:
         terminal.print_table(args, "RMS error on the part that nothing was fitted to", columns, lines)
 
 
-def say_located(args: argparse.Namespace, located: Any, most: int = 4) -> None:
-    """Print where a stage (`identification.regimes.Located`) fails, under ``most`` conditions at most."""
+def say_located(args: argparse.Namespace, located: Any) -> None:
+    """Print where a stage (`identification.regimes.Located`) fails, under four conditions at most."""
     terminal.say(args, f"{located.stage}: {located.verdict()}")
     if located.onset is not None:
         terminal.say(args, f"  begins at t = {located.onset:.0f} s")
-    for r in located.hot[:most]:
+    for r in located.hot[:4]:
         terminal.say(args, f"  {r.worst()}")
 
 

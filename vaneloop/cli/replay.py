@@ -155,10 +155,7 @@ def _limits(options: list[str]) -> dict[tuple[str, str], float]:
             allowed = f"{', '.join(STAGE)}, each also with .{', .'.join(STATISTICS)}"
             near = meant(key, [*STAGE, *(f"{s}.{k}" for s in STAGE for k in STATISTICS)])
             raise InputError(f"--tolerance {key}={text}: {key!r} is not known{near}; allowed: {allowed}")
-        try:
-            value = float(text)
-        except ValueError:
-            value = float("nan")
+        value = terminal.number(text)
         if not value >= 0.0 or value == float("inf"):
             raise InputError(f"--tolerance {key}={text}: {text!r} must be a number of 0 or more")
         out[signal, statistic] = value

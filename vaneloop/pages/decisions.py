@@ -14,9 +14,7 @@ Explained = tuple[Sequence[Decision], Collection[str]]  # decisions, and names o
 SHOWN = 40  # decisions in one table: what was accepted, and what came nearest
 
 
-def decision_table(
-    decisions: Sequence[Decision], chosen: Collection[str], most: int = SHOWN
-) -> tuple[list[str], list[list[str]]]:
+def decision_table(decisions: Sequence[Decision], chosen: Collection[str]) -> tuple[list[str], list[list[str]]]:
     """Columns and rows: a candidate each, accepted ones first, then those that fail fewest rules.
 
     chosen  names of the effects and curves of the answer: of what is accepted the best is chosen
@@ -25,7 +23,7 @@ def decision_table(
     def is_chosen(d: Decision) -> bool:
         return d.accepted and bool(d.added) and set(d.added) == set(chosen)
 
-    ordered = sorted(decisions, key=lambda d: (not is_chosen(d), sum(not v.holds for v in d.verdicts)))[:most]
+    ordered = sorted(decisions, key=lambda d: (not is_chosen(d), sum(not v.holds for v in d.verdicts)))[:SHOWN]
     rules = [name for name in RULES if any(v.rule == name for d in ordered for v in d.verdicts)]
     rows = []
     for d in ordered:
