@@ -4,7 +4,7 @@ An outline has the page's words, its tiles, its tables' cells and of each figure
 it has how many there are, the first, the last, the range and the mean, to four digits, so that it is the same on other
 machines. What nearly every figure has (`USUAL`) is left out.
 
-`RENEW_OUTLINES=1 pytest tests/test_page_outlines.py` writes the approved texts anew: read what `git diff` shows.
+`RENEW_OUTLINES=1 pytest` on the test's file writes the approved texts anew: read what `git diff` shows.
 """
 
 from __future__ import annotations
@@ -205,5 +205,6 @@ def approve(name: str, text: str) -> None:
         diff = difflib.unified_diff(
             approved.splitlines(), text.splitlines(), f"approved {file.name}", "now", n=1, lineterm=""
         )
-        how = f"If that is right: {RENEW}=1 pytest tests/test_page_outlines.py, and read the diff of tests/outlines."
+        test = os.environ.get("PYTEST_CURRENT_TEST", "tests").split("::")[0]
+        how = f"If that is right: {RENEW}=1 pytest {test}, and read the diff of tests/outlines."
         pytest.fail("\n".join([*diff, how]), pytrace=False)

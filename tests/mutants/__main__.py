@@ -171,7 +171,7 @@ NEAREST = {
         "cli_spec experiment_own help exit_codes completion verbs search_commands campaign fuzz inject record design "
         "fleet_report fmu guess schedule strategies spatial never_worse native xcp uds reading electromechanical"
     ),
-    "vaneloop.web": "web_spec web moments",
+    "vaneloop.web": "web_spec web_pages_spec web_processes_spec web moments",
 }
 OF_A_GPU = {"hil.loop": ("cuda.py",)}  # a part of its own: numba's simulator runs it in another process
 STRICTLY = ("controller", "hil.bus", "hil.calibrate", "hil.uds", *CORE)

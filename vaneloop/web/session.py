@@ -603,7 +603,6 @@ class Session:
 
     async def _recommend(self) -> None:
         assert self.diagnosis is not None
-        self.touch("experiment")
         given = {"words": self.words(), "diagnosis": self.diagnosis["diagnosis"]}
         self.experiment = await self.search.call("experiment", "trying demand profiles", **given)
         self.experiment_done = True
