@@ -42,10 +42,13 @@ from vaneloop.web.xy import MOST, Plane, arrows, plane, xy_figure
 # ---- asked for, and answered -----------------------------------------------------------------------------------------
 
 
+NOBODY = 1 << 23  # of no process: beyond what Linux numbers
+
+
 class Started:
     """In place of a process: it ends when it is told to."""
 
-    def __init__(self, pid: int = 4242):
+    def __init__(self, pid: int = NOBODY):
         self.pid, self.code, self.over = pid, 0, threading.Event()
         ours, theirs = socket.socketpair()
         self.ours, self.theirs = Connection(ours.detach()), Connection(theirs.detach())
@@ -69,7 +72,7 @@ class Spares:
         self.taken: list[Started] = []
 
     def take(self) -> Any:
-        self.taken.append(Started(4242 + len(self.taken)))
+        self.taken.append(Started(NOBODY + len(self.taken)))
         return self.taken[-1], self.taken[-1].ours
 
 
@@ -123,7 +126,7 @@ def test_a_question_is_answered_and_its_progress_told(monkeypatch: pytest.Monkey
         w.stop()
         with pytest.raises(Cancelled, match="stopped"):
             await third
-        assert w.process is None and not w.jobs and killed == [4242]
+        assert w.process is None and not w.jobs and killed == [NOBODY]
 
     def stopped(p: Any) -> None:
         killed.append(p.pid)
@@ -196,9 +199,8 @@ def test_a_spare_process_is_there_for_the_next(monkeypatch: pytest.MonkeyPatch) 
     later: list[tuple[float, Any]] = []
     monkeypatch.setattr(jobs, "_launch", launch)
     monkeypatch.setattr(jobs, "_kill", killed.append)
-    monkeypatch.setattr(
-        jobs.asyncio, "get_running_loop", lambda: SimpleNamespace(call_later=lambda *a: later.append(a))
-    )
+    of_loop = SimpleNamespace(call_later=lambda *a: later.append(a))
+    monkeypatch.setattr(jobs, "asyncio", SimpleNamespace(get_running_loop=lambda: of_loop))
     spare = Spare("m")
     spare.refill()
     spare.refill()
@@ -343,11 +345,14 @@ def test_what_listens_sorts_questions_from_news_and_ends_with_the_server(monkeyp
     connection.send((0, "tell", {"stop": True}))
     connection.send((5, "last", {}))
     monkeypatch.setattr(process.queue, "Queue", Ends)
-    with pytest.raises(KeyboardInterrupt):
-        process.answer(theirs.detach(), {"last": lambda progress: box.put(5, {"late": 1})})
-    assert connection.recv() == ("done", 5, None)
-    connection.close()
-    assert ended.wait(5.0) and killed == [(os.getpgrp(), 9)]
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            process.answer(theirs.detach(), {"last": lambda progress: box.put(5, {"late": 1})})
+        assert connection.recv() == ("done", 5, None)
+    finally:
+        connection.close()
+        ended.wait(5.0)  # as long as nothing is killed
+    assert killed == [(os.getpgrp(), 9)]
     assert box.take() == {"late": 1} and box.take() is None
 
 
