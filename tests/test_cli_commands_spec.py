@@ -1269,3 +1269,152 @@ def test_a_log_is_put_into_the_subsystems_of_a_machine(log: str, ran: Ran, monke
     args.plant = "plant_two_actuators.toml"
     with pytest.raises(Exception, match="judging subsystems"):
         chains.chain_of(args)
+
+
+def test_what_else_is_in_a_log_is_told(ran: Ran, log: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from vaneloop.cli import map as of_map
+
+    def row(signal: str, how: str) -> Any:
+        return SimpleNamespace(signal=signal, name=f"in the log {signal}", unit="%", how=how, confidence=0.87, low=1.0,
+                               high=2.5, curve=np.array([1.0, 2.0]))  # fmt: skip
+
+    seen = SimpleNamespace(
+        rows=[row("t", "as named"), row("n_dem", "guessed"), row("n_r", "as named")], other=["spare", "more"],
+        open={"i_cmd": "two names could be it"}, unused=lambda: ["spare: 3 samples"], dbc=None, complaint="",
+        notes=["N is guessed to be n_dem", "i_cmd: two names could be it, a or b", "3 rows are out of order"],
+        to_dict=lambda: {"seen": 1}, bench=lambda: {"names": {"n_dem": "N"}},
+    )  # fmt: skip
+    asked: list[Any] = []
+    compared: dict[str, Any] = {"what": "frames", "ours": "3", "theirs": "3", "by": "python-can"}
+    found = [SimpleNamespace(**compared, same=s, to_dict=lambda s=s: {"same": s}) for s in (True, None)]
+    monkeypatch.setattr(of_map, "survey", lambda *given, **more: asked.append((given, sorted(more))) or seen)
+    monkeypatch.setattr("hil.logs.others.compare", lambda *given: asked.append(given) or found)
+    monkeypatch.setattr(of_map, "write_mapping", lambda *given: asked.append(given))
+    assert ran("map", log, "--check", "--out", "b.toml", *J) == 0
+    found[1].same = False
+    assert ran("map", log, "--check", "--quiet") == 1
+    seen.complaint = "no time"
+    assert ran("map", log, "--export", "x.csv") == 1 and not (ran.folder / "x.csv").exists()
+    ran.out += [str(a) for a in asked]
+    approve("cli_map_more", ran.text())
+
+
+def test_a_measured_loop_is_scheduled(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
+    from tests.test_web_pages_spec import links
+    from vaneloop.cli import schedule
+
+    result = links()
+    result.log = "loop.csv"
+    for s in result.links:
+        s.error_initial = s.error + 1.0
+        for figures in (s.at_design, s.rms, s.largest):
+            figures |= {"extension": 0.5, "retraction": 0.25}
+    for k, m in enumerate(result.loops.values()):
+        m.misfit, m.drift, m.lag, m.extension_covered, m.retraction_covered = (
+            0.01,
+            None if k else 0.02,
+            0.0123,
+            (1, 40),
+            (2, 39),
+        )
+    asked: list[Any] = []
+    monkeypatch.setattr(schedule, "schedule", lambda g, s, log, options, tell: asked.append((log, options)) or result)
+    monkeypatch.setattr(schedule, "result_json", lambda result: {"schema": 1})
+    monkeypatch.setattr(schedule, "schedule_page", lambda result, path, words: f"{path} of {words}")
+    monkeypatch.setattr(schedule, "write_tables", lambda result, out: [Path(out) / "a.toml", Path(out) / "b.toml"])
+    monkeypatch.setattr(schedule.options, "read_log_of", lambda args, require: (args.log, require))
+    assert ran("schedule", "--log", "loop.csv", "--adjust", " lb , lc", "--report", "p.html", "--out", "o", *J) == 0
+    result.links = result.links[:1]
+    result.loops, result.speed = {}, result.speed - 50.5
+    assert ran("schedule", "--step", "0.25") == 0
+    ran.out += [str(a) for a in asked]
+    approve("cli_schedule_loop", ran.text())
+
+
+def test_what_a_node_says(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    from hil.loop.node import Node
+    from plant import build_plant
+    from vaneloop.cli import run, station
+
+    args = argparse.Namespace(model="m.toml", quiet=False, json=None, secoc=None, xcp=True, uds=False)
+    same = SimpleNamespace(plant=build_plant())
+    run._say_engine(args, same, "vcan0")
+    other = SimpleNamespace(plant=build_plant())
+    other.plant.p[run.ACCELERATION] *= 1.1
+    run._say_engine(argparse.Namespace(model=None, quiet=False), other, "vcan0")
+    assert capsys.readouterr().out == ""
+    run._say_engine(args, other, "vcan0")
+    assert capsys.readouterr().out.strip() == (
+        "note: the engine of m.toml runs in the ECU: vaneloop ecu --bus vcan0 --model m.toml"
+    )
+    monkeypatch.setattr(run, "observables", lambda foreign: {"seen": {"value": 1.5, "unit": "V", "meaning": "what"}})
+    run._say_node(args, Node())
+    assert "seen: 1.5 V (what)" in capsys.readouterr().out
+    assert run._node_json(Node())["own"] == {"seen": {"value": 1.5, "unit": "V", "meaning": "what"}}
+    lost = SimpleNamespace(lost={"xcp": {"dropped": 1200, "untaken": 3}})
+    assert run._say_tools(args, lost) == {"tools": lost.lost}
+    assert capsys.readouterr().out == "tools over XCP: 1,200 frames dropped, 3 answers not taken\n"
+    args.xcp = False
+    assert run._say_tools(args, lost) == {}
+    for cached in (True, False):
+        monkeypatch.setattr(station, "is_cached", lambda run, cached=cached: cached)
+        station.warm_nodes(args)
+        assert ("compiling the nodes" in capsys.readouterr().out) is not cached
+
+
+def test_a_bus_is_joined_left_and_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from vaneloop.base.errors import InputError
+    from vaneloop.cli import station
+
+    opened: list[Any] = []
+    bus = SimpleNamespace(shutdown=lambda: opened.append("left"))
+    monkeypatch.setattr(station, "open_bus", lambda name, **more: opened.append((name, more)) or bus)
+    for name, priority in (("local:x", None), ("local", 7), ("vcan0", 7)):
+        with pytest.raises(ValueError, match="x"), station.joined(name, priority, can_filters=1) as joined:
+            assert joined is bus
+            raise ValueError("x")
+    of_broker = [("local:x", {"can_filters": 1, "priority": 0}), ("local", {"can_filters": 1, "priority": 7})]
+    assert opened[::2] == [*of_broker, ("vcan0", {"can_filters": 1})] and opened[1::2] == ["left"] * 3
+    assert station.bus_name(argparse.Namespace(bus="x")) == "x"
+    said: list[str] = []
+    monkeypatch.setattr(station.BusWatch, "_say", lambda watch, text: said.append(text))
+    port = SimpleNamespace(refused=0, errors=0)
+    watch = station.BusWatch(argparse.Namespace(quiet=False), "nowhere0", port)
+    port.refused = 1
+    for k in range(201):
+        watch(k)
+    assert len(said) == 1
+    watch(201)
+    assert said[1] == "nowhere0: takes frames again after 0.0 s; 1 were not sent"
+    flags: dict[str, str] = {}
+    monkeypatch.setattr(station, "Path", lambda path: SimpleNamespace(read_text=lambda: flags[path]))
+    for text, why in (("0x1003", "does not take frames (full or bus-off)"), ("0x1002", "is down"),
+                      ("x", "does not take frames (gone, full or bus-off)")):  # fmt: skip
+        flags["/sys/class/net/nowhere0/flags"] = text
+        assert watch._why() == why
+
+    @contextmanager
+    def refused(priority: Any, cpu: Any) -> Iterator[list[str]]:
+        raise PermissionError(1, "Operation not permitted")
+        yield []
+
+    monkeypatch.setattr(station.realtime, "undisturbed", refused)
+    args = argparse.Namespace(realtime_priority=5, cpu=None)
+    why = "--realtime-priority 5: Operation not permitted; run as root, or allow it with ulimit -r 5"
+    with pytest.raises(InputError) as e, station.undisturbed(args):
+        pass
+    assert str(e.value) == why
+
+
+def test_options_are_offered_where_they_count() -> None:
+    from vaneloop.cli import options
+
+    def offered(**more: Any) -> set[str]:
+        parser = argparse.ArgumentParser()
+        options.add_controller_options(parser, **more)
+        return {a.dest for a in parser._actions} - {"help"}
+
+    assert offered() == {"controller", "save_crash"} and offered(save_crash=False) == {"controller"}
+    parser = argparse.ArgumentParser()
+    options.add_tables_option(parser, plant=False)
+    assert {a.dest for a in parser._actions} == {"help", "tables"}

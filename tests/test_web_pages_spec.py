@@ -661,3 +661,110 @@ def test_a_run_of_a_fleet(monkeypatch: pytest.MonkeyPatch, session: Session, tmp
 
     in_a_loop(go())
     assert fleet.runs_in(tmp_path) == ["a/b/c/d/e", "more", "runs/one", "runs/two"][1:]
+
+
+# ---- what a session does ---------------------------------------------------------------------------------------------
+
+
+def test_what_is_stopped_is_what_was_named(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    stopped: list[str] = []
+    jobs = {"search": ("diagnose", "look"), "bench": ("refit",), "aside": ("judge",)}
+    for worker, names in jobs.items():
+        w = getattr(session, worker)
+        w.jobs.update({k: Job(k, n, n, None, started=0.0) for k, n in enumerate(names)})  # type: ignore[arg-type]
+        monkeypatch.setattr(w, "stop", lambda worker=worker: stopped.append(worker))
+    assert [j.name for j in session.jobs] == ["diagnose", "look", "refit", "judge"]
+    assert session.busy("refit", "judge") is session.bench.jobs[0] and session.busy("none") is None
+    for names, ends in ((("look",), ["search"]), (("judge",), ["aside"]), ((), ["search", "bench"]), (("none",), []),
+                        (("refit", "judge"), ["bench", "aside"])):  # fmt: skip
+        stopped.clear()
+        session._hand_wanted = True
+        session.stop(*names)
+        assert stopped == ends and session._hand_wanted is False
+    for worker in jobs:
+        getattr(session, worker).jobs.clear()
+
+
+def test_switching_forgets_what_was_set_by_hand(session: Session) -> None:
+    async def go() -> None:
+        session.stage, session.chosen = "actuator", {"actuator": ("grip",)}
+        session.hand, session.hand_rms = {"grip": {"size": 0.7}}, {"x_lvdt": 1.0}
+        session.do = lambda section, work: work.close()  # type: ignore[method-assign]
+        session.switch("more", True)
+        assert session.chosen == {"actuator": ("grip", "more")} and session.hand == {} and session.hand_rms == {}
+        session.switch("grip", True)
+        assert session.chosen == {"actuator": ("more", "grip")}
+        session.switch("more", False)
+        assert session.chosen == {"actuator": ("grip",)}
+
+    asyncio.run(go())
+
+
+def test_a_page_looks_again_soon_but_not_too_often(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock(monkeypatch, "frame")
+    later: list[Any] = []
+
+    async def go() -> None:
+        opened = Opened(session, missing.build)
+        loop: Any = asyncio.get_running_loop()
+        monkeypatch.setattr(loop, "call_later", lambda wait, call: later.append((wait, call)))
+        live = opened.live
+        live.soon, live.looked = False, 99.97
+        session.touch("log")
+        assert [(round(w, 9), c) for w, c in later] == [(0.02, live.look)] and live.soon
+        session.touch("log")
+        assert len(later) == 1
+        clock.now = 101.0
+        opened.look()
+        assert live.soon is False and live.looked == 101.0
+        clock.now = 102.0
+        session.touch("log")
+        assert later[1][0] == 0.0
+
+    in_a_loop(go())
+
+
+def test_a_run_that_hangs_is_ended_and_its_controller_named(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
+    from vaneloop.web import running
+
+    clock = Clock(monkeypatch, "running")
+    loop: Any = running.Loop(session)
+    stopped: list[int] = []
+    wait = asyncio.wait
+
+    async def waiting(tasks: Any, timeout: float) -> Any:
+        assert timeout == 0.5
+        clock.now += timeout
+        return await wait(tasks, timeout=0.0)
+
+    ticks = [b"a", b"b"] + [b"c"] * 1000
+    monkeypatch.setattr(running.asyncio, "wait", waiting)
+    monkeypatch.setattr(running.black_box, "progress", lambda boxes: ticks.pop(0))
+    monkeypatch.setattr(running.black_box, "left", lambda boxes: "the box")
+    monkeypatch.setattr(running.isolation, "told", lambda box, why: f"{box}: {why}")
+
+    async def watched(patience: bool) -> str:
+        future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+
+        def stop() -> None:
+            stopped.append(round(clock.now))
+            if not future.done():
+                future.set_exception(Cancelled("stopped"))
+
+        async def call() -> Any:
+            return await future
+
+        if not patience:
+            future.set_exception(WorkError("ended"))
+        try:
+            return str(await loop._watched(SimpleNamespace(stop=stop), call()))
+        except WorkError as e:
+            return str(e)
+
+    loop.boxes = session.folder
+    patience = running.isolation.PATIENCE
+    assert asyncio.run(watched(True)) == f"the box: did not come back within {patience:g} s"
+    assert stopped[0] == pytest.approx(100.0 + 1.5 + patience, abs=1.1)
+    assert asyncio.run(watched(False)) == "the box: ended its process"
+    monkeypatch.setattr(running.black_box, "left", lambda boxes: None)
+    assert asyncio.run(watched(False)) == "ended"

@@ -1139,6 +1139,38 @@ def test_what_a_fleet_s_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         worker.fleet_log(silent, "r", "x")
 
 
+def test_what_a_log_will_need_is_loaded_before_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    from vaneloop.web import held
+
+    told: list[Any] = []
+    monkeypatch.setattr(worker, "warm_up", lambda say: say("compiling"))
+    monkeypatch.setattr(worker, "tell_search", lambda say: say("compiling the search"))
+    bound: list[Any] = []
+    machine = SimpleNamespace(bind=lambda log: bound.append(log) or SimpleNamespace(stages=["a stage"]))
+    monkeypatch.setattr(worker, "Machine", lambda: machine)
+    monkeypatch.setattr(worker, "locate_stages", told.append)
+    run = SimpleNamespace(t=np.arange(3.0), columns={"n_dem": np.ones(3), "t": np.arange(3.0), "odd": np.ones(3)})
+    asked: list[Any] = []
+    monkeypatch.setattr(worker, "lockstep", lambda stimulus, seed: asked.append((stimulus.rows.shape[0], seed)) or run)
+    worker.ready(lambda *a: told.append(a))
+    assert told == [(None, "compiling"), (None, "compiling the search"), ["a stage"]] and asked == [(2000, 1)]
+    assert list(bound[0].channels) == ["n_dem"]
+    said: list[str] = []
+    monkeypatch.setattr(held, "warm_up", lambda say: say("compiling"))
+    monkeypatch.setattr(held, "tell_search", lambda say: say("the search"))
+    monkeypatch.setattr(held, "_OfMachine", lambda args: ("of a machine", args))
+    monkeypatch.setattr(held, "_OfSystem", lambda args, system: ("of", system))
+    monkeypatch.setattr(held, "load_system", lambda path: path)
+    monkeypatch.setattr(held.own_model, "asked", lambda args: bool(args.system))
+    args = SimpleNamespace(system=None)
+    assert held.held(args, said.append) == ("of a machine", args)  # type: ignore[arg-type, comparison-overlap]
+    assert said == ["compiling", "reading the log", "the search"]
+    said.clear()
+    args.system = "own.py"
+    assert held.held(args, said.append) == ("of", "own.py")  # type: ignore[arg-type, comparison-overlap]
+    assert said == ["reading the log, fitting the model to it"]
+
+
 # ---- the server ------------------------------------------------------------------------------------------------------
 
 

@@ -168,8 +168,9 @@ NEAREST = {
         "search_commands trust latest"
     ),
     "vaneloop.cli": (
-        "cli_spec cli_commands_spec experiment_own help exit_codes completion verbs search_commands campaign fuzz inject record design "
-        "fleet_report fmu guess schedule strategies spatial never_worse native xcp uds reading electromechanical"
+        "cli_spec cli_commands_spec experiment_own help exit_codes completion verbs search_commands "
+        "campaign fuzz inject record design fleet_report fmu guess schedule strategies spatial "
+        "never_worse native xcp uds reading electromechanical"
     ),
     "vaneloop.web": "web_spec web_pages_spec web_processes_spec web moments",
 }
