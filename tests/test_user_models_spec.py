@@ -18,18 +18,27 @@ from numba.core.compiler import run_frontend
 from hil.logs.notes import Note
 from plant.model import Learned
 from vaneloop.base.errors import InputError
+from vaneloop.base.hysteresis import STOPS
 from vaneloop.identification import Parameter, Record, StageError, System, unknown
 from vaneloop.identification.candidates.library import Size
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.results import StageDiagnosis
 from vaneloop.identification.selection.diagnosis import diagnose_stage
-from vaneloop.identification.settings import LEVEL_SPREAD
+from vaneloop.identification.settings import COARSE_STOPS, LEVEL_SPREAD
 from vaneloop.identification.subsystem import Array
+from vaneloop.identification.user_models import experiment, terms
 from vaneloop.identification.user_models.bound_system import BoundSystem, steps_seen
 from vaneloop.identification.user_models.by_log import ByLog, Logs, _loaded, as_given, bind, parameter_warnings
 from vaneloop.identification.user_models.codegen import try_law
 from vaneloop.identification.user_models.data import Data, noise_of_channel, noise_of_neighbours, spikes, without_order
-from vaneloop.identification.user_models.exogenous_regressors import column_of, every, forgotten, sides_of, swings
+from vaneloop.identification.user_models.exogenous_regressors import (
+    column_of,
+    every,
+    forgotten,
+    share_given_back,
+    sides_of,
+    swings,
+)
 from vaneloop.identification.user_models.experiment import (
     SHAPES,
     Limits,
@@ -1883,3 +1892,92 @@ def test_an_own_law_of_a_state_is_taken_off_its_rate() -> None:
     theta[bound.stage.index()[name]] = 0.3
     wanted = integrated(lambda t, x, u: u - 1.1 * x, bound.data.u[0][0], 0.7)
     assert bound.run(theta[None])[0, 0] == pytest.approx(wanted, abs=4e-3 * np.abs(wanted).max())
+
+
+# ---- what runs and curves are made of --------------------------------------------------------------------------------
+
+
+def test_shapes_are_ramps_sweeps_and_levels() -> None:
+    s = np.linspace(0.0, 1.0, 801)
+    x = (3.0 * s) % 1.0
+    assert experiment._triangle(3.0, 0.5)(s) == pytest.approx(0.5 * np.where(x < 0.5, 4.0 * x - 1.0, 3.0 - 4.0 * x))
+    assert experiment._triangle(1.0)(np.array([0.0, 0.25, 0.5, 0.75])) == pytest.approx([-1.0, 0.0, 1.0, 0.0])
+    phase = 2.0 * np.pi * (s + 0.5 * (9.0 - 1.0) * s**2)  # from one cycle a run to nine
+    assert experiment._chirp(0.2, 9.0)(s) == pytest.approx(0.2 * np.sin(phase), abs=1e-9)
+    drawn = np.random.default_rng(7).uniform(-1.0, 1.0, 4)
+    levels = experiment._levels(4, 7)(s)
+    assert levels.tolist() == drawn[np.minimum((4.0 * s).astype(int), 3)].tolist()
+    assert experiment._levels(4, 8)(s).tolist() != levels.tolist()
+    ends = experiment._levels(40, 7, ends=True)(s)
+    assert set(ends) == {-1.0, 1.0} and np.count_nonzero(np.diff(ends)) > 5
+
+
+def test_a_course_of_a_motion_is_as_smooth_as_forces_are_compared() -> None:
+    def bench(cutoff: float | None, rate: float = np.inf) -> Any:
+        return SimpleNamespace(
+            ranges={"x": (-1.0, 2.0), "u": (-1.0, 2.0)}, t=0.01 * np.arange(400),
+            limits=Limits(rates={"x": rate, "u": rate}),
+            system=SimpleNamespace(position="x", velocity=None),
+            bound=SimpleNamespace(data=SimpleNamespace(motion_cutoff=cutoff)),
+        )  # fmt: skip
+
+    step = np.where(np.arange(400) < 200, -1.0, 5.0)
+    rough = np.clip(step, -1.0, 2.0)
+    assert _Bench._within(bench(None), "x", step).tolist() == rough.tolist()
+    assert _Bench._within(bench(5.0), "u", step).tolist() == rough.tolist()  # no motion
+    for cutoff, half in ((5.0, 20), (200.0, 1)):
+        smooth = _Bench._within(bench(cutoff), "x", step)
+        weights = np.hanning(2 * half + 3)
+        assert len(smooth) == 400 and smooth[[0, -1]].tolist() == pytest.approx([-1.0, 2.0])
+        assert np.diff(smooth)[199 - half : 200 + half] == pytest.approx(
+            3.0 * weights[1:-1][: 2 * half + 1] / weights.sum()
+        )
+        assert np.count_nonzero(np.abs(np.diff(smooth)) > 1e-12) == 2 * half + 1
+    limited = _Bench._within(bench(None, 2.0), "x", step)
+    assert np.diff(limited).max() == pytest.approx(0.02) and limited[350] == pytest.approx(2.0)
+    assert limited[199:300] == pytest.approx(-1.0 + 0.02 * np.arange(101))
+
+
+def test_a_curve_with_a_jump_is_whole_with_it() -> None:
+    jump = terms.Curve("output adds", 0, terms.INPUT, "u", 0.0, 4.0, lambda v: np.full(5, v[0]), lambda v: (v[1], 2.0))
+    values = np.array([3.0, 0.5])
+    assert jump.whole(values).tolist() == [2.5, 2.5, 3.0, 3.5, 3.5]
+    assert jump.whole(np.array([3.0, 0.0])).tolist() == [3.0] * 5
+    assert jump.at(np.array([1.0, 3.0]), jump.row(values)).tolist() == [2.5, 3.5]
+
+
+def test_what_a_simulation_is_told_of_its_curves() -> None:
+    follows = np.array([0.0, 1.0, -2.0, 3.0])
+    data: Any = SimpleNamespace(column=lambda log, name: {"v": follows, f"{STOPS}v": follows}[name])
+    table = np.linspace(0.0, 2.0, 9)
+    stops = terms.Curve("state adds", 1, terms.COLUMN, f"{STOPS}v", 0.0, 4.0, lambda v: table)
+    plain = terms.Curve("parameter times", 2, terms.COLUMN, "v", -3.0, 5.0, lambda v: v[0] * np.ones(257),
+                        lambda v: (0.25, 1.5), period=2.0)  # fmt: skip
+    of_state = terms.Curve("output times", 0, 1, "x", 0.0, 2.0, lambda v: np.zeros(257))
+    rows = [(stops, table), (plain, plain.row(np.array([2.0]))), (of_state, np.zeros(257))]
+    how, place, of, low, per, tables, jumps, columns = terms.curves_for_kernel(rows, data, 0, 3, np.array([0.5, 0.125]))
+    made = stops.at(follows[:3], table)
+    assert how.tolist() == [4, 1, 6] and place.tolist() == [1, 2, 0]
+    assert of.tolist() == [[terms.COLUMN, -1], [terms.COLUMN + 1, -1], [1, -1]]
+    assert columns.tolist() == [made.tolist(), follows[:3].tolist()]
+    b = np.abs(made).max()
+    assert low.tolist() == [-b, -3.0, 0.0] and tables[0] == pytest.approx(np.linspace(-b, b, 257))
+    assert per == pytest.approx([256 / (2 * b), 256 / 8.0, 256 / 2.0])
+    assert tables[1].tolist() == [2.0] * 257 and jumps[1].tolist() == [0.25, 1.5, 1e-300, 2.0]
+    assert jumps[2].tolist() == [0.0, 0.0, 0.125, 0.0]
+    (_, _, _, _, _, none, _, no_columns) = terms.curves_for_kernel([], data, 0, 3, np.zeros(0))
+    assert none.shape == (0, 257) and no_columns.shape == (0, 3)
+
+
+def test_stops_give_energy_where_their_weights_have_both_signs() -> None:
+    radii = 2.0 * np.linspace(0.0, 1.0, COARSE_STOPS + 1)[1:] ** 2
+    x = np.linspace(0.0, 2.0, 4001)
+
+    def share(*weights: float) -> float:
+        table = sum(w * np.minimum(x, r) for w, r in zip(weights, radii, strict=False))
+        return share_given_back(0.0, 2.0, np.asarray(table))
+
+    assert share(1.0, 2.0, 0.5) == pytest.approx(0.0, abs=1e-3) and share(-1.0, -2.0) == pytest.approx(0.0, abs=1e-3)
+    assert share(3.0, -1.0, 1.0) == pytest.approx(0.2, abs=0.02)
+    assert share(-3.0, 1.0) == pytest.approx(0.25, abs=0.02)
+    assert share_given_back(0.0, 2.0, np.zeros(9)) == np.inf
