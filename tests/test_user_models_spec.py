@@ -751,6 +751,8 @@ def test_a_force_that_drives_against_the_motion_is_said(sign: float) -> None:
             f"force drives positive motion: {turned}",
         ]
     )  # fmt: skip
+    d.base = SimpleNamespace(theta=d.base.theta + 0.5)  # type: ignore[assignment]  # what a law has taken over
+    assert not any(line.startswith("c ") for line in parameter_warnings(logs.fitted, judge, d))
 
 
 # ---- the next run ----------------------------------------------------------------------------------------------------

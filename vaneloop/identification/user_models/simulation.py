@@ -266,7 +266,7 @@ class Runner:
             c = float(curve.at(curve.value(first), row)[0])
             x0[m] = reading - c if curve.how == "output adds" else reading / max(1.0 + c, 0.1)
 
-    def _algebraic(self, p: Array, log: int, active: list[tuple[Placed, Array]], position: float = 0.0) -> Array:
+    def _algebraic(self, p: Array, log: int, active: list[tuple[Placed, Array]], position: float) -> Array:
         t, u = self.data.times[log], self.data.u[log]
         if position != 0.0:
             u = np.concatenate([u[:1] + position, u[1:]])

@@ -112,7 +112,7 @@ class UserCode:
     def static(self, p: Array, u: Array, t: Array, check: bool = False) -> Array:
         """Outputs float64[outputs, samples] of a model of kind static or force, driven by ``u`` at times ``t``."""
         s = self.system
-        n = u.shape[1] if u.size else len(t)
+        n = len(t)
         args = self.R(*u) if len(u) else self.R(np.zeros(n))
         values = self.call("model", s.model, args, self.P(*p) if len(p) else self.P(0.0))
         rows = list(values) if isinstance(values, tuple | list) else [values]
