@@ -18,7 +18,7 @@ from vaneloop.identification import Effect, Parameter, Stage
 from vaneloop.identification.candidates.closed_forms import Formula
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import diagnose_stage
-from vaneloop.identification.settings import LEVEL_SPREAD
+from vaneloop.identification.settings import LEAST_FALL, LEAST_OF_NOISE, LEVEL_SPREAD, NATS
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled.closed_form_fits import Product, goes_on
 from vaneloop.identification.unmodelled.curve_candidates import (
@@ -32,7 +32,15 @@ from vaneloop.identification.unmodelled.curve_candidates import (
     surface_of,
 )
 from vaneloop.identification.unmodelled.curve_choice import stands_before
-from vaneloop.identification.unmodelled.fitted_candidate import adds_what, channel_of, plain, strange
+from vaneloop.identification.unmodelled.fitted_candidate import (
+    adds_what,
+    channel_of,
+    left_by_its_mean,
+    one_constant,
+    plain,
+    step_without,
+    strange,
+)
 from vaneloop.identification.unmodelled.learned_law import LearnedLaw, LearnedSurface, law_of
 from vaneloop.identification.unmodelled.learning import CurveSearch
 from vaneloop.identification.unmodelled.problem import promises
@@ -325,6 +333,30 @@ def test_the_best_step_is_that_of_damped_least_squares() -> None:
     rows = np.vstack([x[:2].T / 0.1, np.diag([np.sqrt(3.0) / 0.5, np.sqrt(3.0) / 3.0])])
     wanted = np.linalg.lstsq(rows, np.concatenate([y / 0.1, [np.sqrt(3.0) / 0.5, 0.0]]), rcond=None)[0]
     assert step.theta == pytest.approx(wanted, abs=0.01)
+    begin_at = np.array([begin[0], 0.0])
+    left = np.concatenate([(y - begin_at @ x[:2]) / 0.1, -rows[-2:] @ (begin_at - [1.0, 0.0])])
+    normal = rows.T @ rows
+    least_damped = begin_at + np.linalg.solve(normal + 0.003 * np.diag(np.diag(normal)), rows.T @ left)
+    assert step.theta == pytest.approx(least_damped, abs=1e-7)
+    narrow = Effect("law", (Parameter("size", 0.0, "1", -50.0, 0.2, 3.0, scale=1.0),), ((1.0,),))
+    alike = x[:2] + np.array([[0.0], [1.0]]) * x[:1]  # the law can stand in for the gain
+    other = Stage(
+        "sum", ("y",), ("1",), stage.parameters, (narrow,), lambda thetas: (thetas @ alike)[:, None], T, y[None],
+        floor=np.array([0.1]),
+    )  # fmt: skip
+    of_other = LeastSquaresProblem(other, np.array([0.1]))
+    nominal = of_other.fit((), other.neutral())
+    ((_, steep),) = starts_of(of_other, nominal)
+    ends, goes_on_with_others = (
+        best_step(nominal, narrow, of_other, nominal.theta[:1], steep, cut_off) for cut_off in (True, False)
+    )
+    assert ends.theta[1] == goes_on_with_others.theta[1] == 0.2
+    start = np.array([nominal.theta[0], 0.0])
+    known = np.vstack([alike.T / 0.1, rows[-2:]])
+    normal = known.T @ known
+    pull = known.T @ np.concatenate([(y - start @ alike) / 0.1, -rows[-2:] @ (start - [1.0, 0.0])])
+    gains = [start[0] + (pull[0] - normal[0, 1] * 0.2) / (normal[0, 0] * (1.0 + d)) for d in (0.003, 0.03, 0.3)]
+    assert min(abs(goes_on_with_others.theta[0] - g) for g in gains) < 1e-6 < abs(ends.theta[0] - gains[0])
     bound = Stage(
         "sum", ("y",), ("1",), (Parameter("gain", 1.0, "1", 0.95, 2.0, 0.5),), (effect,),
         stage.run, T, y[None], floor=np.array([0.1]),
@@ -589,3 +621,203 @@ def test_where_a_law_holds_is_said() -> None:
         assert said.removeprefix("a function of u ") in replace(curve, how=how).sentence()
     assert "near 2 u" in replace(curve, formulas=[formula]).sentence() and "near" not in spoken.sentence()
     assert curve.of_the_kind_of(replace(curve, x=curve.y)) and not curve.of_the_kind_of(replace(curve, at="z"))
+
+
+# ---- what is left without a part of a curve --------------------------------------------------------------------------
+
+
+def quadratic(low: float = -np.inf, high: float = np.inf) -> Any:
+    """A fit of two parameters of a model and a curve of three, whose errors are straight in all of them, in two blocks
+    of samples. The first of the model's lies between ``low`` and ``high``.
+    """
+    rng = np.random.default_rng(3)
+    jac = rng.standard_normal((2, 30, 5))
+    errors = 0.1 * rng.standard_normal((2, 30))
+    theta, scale = np.array([1.0, 2.0, 0.5, -0.4, 0.3]), np.array([1.0, 0.5, 2.0, 1.0, 4.0])
+    index = {"law": slice(2, 5)}
+    bounds = np.full(5, -np.inf), np.full(5, np.inf)
+    bounds[0][0], bounds[1][0] = low, high
+    stage: Any = SimpleNamespace(index=lambda: index, grain=1.0, neutral=lambda: np.array([0.9, 2.5, 0.0, 0.0, 0.0]))
+    fit = SimpleNamespace(
+        theta=theta, free=np.arange(5), cost=(errors**2).sum(axis=1), normals=np.einsum("bsi,bsj->bij", jac, jac),
+        gradients=np.einsum("bs,bsi->bi", errors, jac), prior=np.zeros(5),
+    )  # fmt: skip
+    judge = SimpleNamespace(stage=stage, scale=scale, bounds=lambda: bounds, n=50.0)
+    candidate = SimpleNamespace(name="law", kept=(0, 1, 2), how="output adds", at="y", quantity=None)
+    return SimpleNamespace(candidate=candidate, fit=fit, judge=judge, jac=jac, errors=errors)
+
+
+def least(jac: Array, errors: Array) -> float:
+    """What least squares leaves."""
+    x = np.linalg.lstsq(jac, errors, rcond=None)[0]
+    return float(((errors - jac @ x) ** 2).sum())
+
+
+def test_with_only_its_mean_a_curve_leaves_what_least_squares_says() -> None:
+    t = quadratic()
+    jac, errors = t.jac.reshape(60, 5), t.errors.reshape(60)
+    moved = errors - jac[:, 3:] @ (-t.fit.theta[3:] / t.judge.scale[3:])  # the curve's bends are gone, its mean is not
+    assert left_by_its_mean(t) == pytest.approx(least(jac[:, :3], moved), rel=1e-6)
+    step = np.linalg.lstsq(jac[:, :3], moved, rcond=None)[0]
+    beyond = 1.0 + 0.5 * step[0]  # where the first of the model's parameters may not go to the end
+    held = quadratic(*sorted((-50.0 if step[0] > 0.0 else 50.0, beyond)))
+    stopped = moved - 0.5 * step[0] * jac[:, 0]
+    assert left_by_its_mean(held) == pytest.approx(least(jac[:, 1:3], stopped), rel=1e-6)
+    t.candidate.kept = (1, 2)
+    assert left_by_its_mean(t) == np.inf
+
+
+def test_where_parameters_move_without_some_blocks() -> None:
+    t = quadratic()
+    held = np.array([True, False])
+    step = step_without(t, held)
+    assert step == pytest.approx(np.linalg.lstsq(t.jac[1], t.errors[1], rcond=None)[0], abs=1e-6)
+    t.fit.prior = np.array([4.0, 8.0, 0.0, 0.0, 0.0])  # of what is known beforehand, as more samples
+    weight = np.sqrt(t.fit.prior) * t.judge.scale
+    away = (t.fit.theta - t.judge.stage.neutral()) / t.judge.scale
+    rows = np.concatenate([t.jac[1], np.diag(weight)])
+    known = np.concatenate([t.errors[1], -weight * away])
+    assert step_without(t, held) == pytest.approx(np.linalg.lstsq(rows, known, rcond=None)[0], abs=1e-6)
+    bounded = quadratic(1.0 - 0.5 * abs(step[0]), 1.0 + 0.5 * abs(step[0]))
+    assert step_without(bounded, held)[0] == pytest.approx(0.5 * step[0])
+
+
+def test_of_constants_at_one_place_the_plainest_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    from vaneloop.identification.unmodelled import fitted_candidate
+
+    def tried(name: str, left: float, cost: float, at: str = "y", grain: float = 1.0) -> Any:
+        judge = SimpleNamespace(stage=SimpleNamespace(grain=grain), n=100.0)
+        candidate = SimpleNamespace(how="output adds", at=at, name=name, strange=len(name))
+        return SimpleNamespace(candidate=candidate, judge=judge, left=left, fit=SimpleNamespace(cost=np.array([cost])))
+
+    monkeypatch.setattr(fitted_candidate, "left_by_its_mean", lambda t: t.left)
+    monkeypatch.setattr(fitted_candidate, "strange", lambda c: c.strange)
+    known = LEAST_OF_NOISE * 100.0
+    flat, plainer, other = tried("long name", 100.0, 100.0), tried("name", 100.0, 100.0), tried("n", 100.0, 100.0, "z")
+    bent = tried("x", 100.0, 100.0 - 1.01 * known)
+    assert one_constant([flat, bent, plainer, other]) == [plainer, bent, other]
+    edge = tried("x", 100.0, 100.0 - 0.99 * known)
+    assert one_constant([flat, edge]) == [edge]
+    wide = tried("x", 1000.0, 1000.0 - 0.99 * LEAST_FALL * 900.0)
+    assert one_constant([flat, wide]) == [wide]
+    assert one_constant([flat, tried("x", 1000.0, 1000.0 - 1.01 * LEAST_FALL * 900.0)])[0] is flat
+    fine = [tried("long", 100.0, 100.0 - f * 2.0 * NATS, grain=0.5) for f in (0.99, 1.01)]
+    assert (
+        one_constant(fine) == fine
+        and one_constant([*fine, tried("a", 100.0, 100.0, grain=0.5)])[0].candidate.name == "a"
+    )
+
+
+def test_a_line_is_highest_where_a_parabola_says() -> None:
+    for top in (-0.4, 0.0, 0.3):
+        assert _between(*(-2.0 * (x - top) ** 2 + 5.0 for x in (-1.0, 0.0, 1.0))) == pytest.approx(top)
+    assert _between(1.0, 1.0, 1.0) == 0.0 and _between(2.0, 1.0, 3.0) == 0.0
+
+
+# ---- a curve among others, on other logs -----------------------------------------------------------------------------
+
+
+def test_a_candidate_is_fitted_where_all_curves_have_settled(monkeypatch: pytest.MonkeyPatch) -> None:
+    from vaneloop.identification.unmodelled import problem
+
+    asked: list[Any] = []
+    judge = SimpleNamespace(sparing=False, fit=lambda *given, **more: asked.append((given, more)) or "the fit")
+    own: Any = SimpleNamespace(judge_of=lambda *given: asked.append(given) or judge)
+    monkeypatch.setattr(problem, "with_held_out", lambda judge, fit: (judge, fit))
+    first, second = np.array([True, True, False]), np.array([False, True, True])
+    before = ("placed before", SimpleNamespace(name="one"))
+    effect = SimpleNamespace(name="two")
+    effects = {0.5: effect}
+    for was, now, quick, kept in ((None, None, False, None), (first, None, False, first), (None, second, False, second),
+                                  (first, second, False, first & second), (first, second, True, None)):  # fmt: skip
+        asked.clear()
+        candidate: Any = SimpleNamespace(settled=now, placed=lambda: "placed", effect=effects.get)
+        current: Any = SimpleNamespace(settled=was, curves=(before,))
+        tried = problem.CurveProblem.fitted(own, current, candidate, 0.5, np.zeros(2), 7, quick)
+        (laws, curves, fast, mask), ((names, begin, iterations), more) = asked
+        assert laws == () and curves == (before, ("placed", effect)) and fast is quick
+        assert (mask is None) == (kept is None) and (kept is None or mask.tolist() == kept.tolist())
+        assert names == ("one", "two") and iterations == 7 and begin.tolist() == [0.0, 0.0] and "slopes" in more
+        assert judge.sparing is True and tried.fit == (judge, "the fit") and tried.wiggle == 0.5
+        assert tried.curves == curves and tried.candidate is candidate
+
+
+def test_what_a_curve_makes_of_each_log() -> None:
+    from vaneloop.identification.unmodelled.problem import CurveProblem
+
+    rng = np.random.default_rng(1)
+    errors = {log: 3.0 * rng.standard_normal((2, 50)) for log in ("a", "b", "c")}
+    errors["b"][0, :3] = np.nan
+
+    def rms(rows: Array) -> Array:
+        return np.sqrt(np.nanmean(rows**2, axis=1))
+
+    asked: list[Any] = []
+    ground = SimpleNamespace(
+        errors=lambda curves, theta: asked.append(curves) or errors, tests={"b"}, within=lambda c: c.inside
+    )
+    own: Any = SimpleNamespace(faint=False, ground=ground, judge=SimpleNamespace(stage=SimpleNamespace(grain=0.25)))
+    own._levels = lambda of, part: CurveProblem._levels(own, of, part)
+    own.change = lambda before, tried, part=None: CurveProblem.change(own, before, tried, part)
+
+    def tried(factor: float, inside: Any = None) -> Any:
+        e = {k: factor * v for k, v in errors.items()} if factor != 1.0 else None
+        return SimpleNamespace(
+            errors=e, curves=factor, fit=SimpleNamespace(theta=0), candidate=SimpleNamespace(inside=inside)
+        )
+
+    before, half = tried(1.0), tried(0.5)
+    half.errors["b"] = 0.01 * errors["b"]
+    change = CurveProblem.change(own, before, half)
+    assert change["a"] == pytest.approx(np.log(0.5)) and asked == [1.0] and before.errors is errors
+    assert change["b"] == pytest.approx(-np.log(rms(errors["b"])).mean())  # below the noise nothing counts
+    some = np.arange(50) < 20
+    part = CurveProblem.change(own, before, half, {"b": some})
+    assert part["b"] == pytest.approx(-np.log(rms(errors["b"][:, some])).mean()) and part["a"] == change["a"]
+    del half.errors["c"]
+    assert set(CurveProblem.change(own, before, half)) == {"a", "b"}
+    inside = [{"b": np.arange(50) < 40}, {"b": np.arange(50) >= 10, "a": np.ones(50, bool)}]
+    among = [tried(0.5, i) for i in inside]
+    both = (np.arange(50) < 40) & (np.arange(50) >= 10)
+    value = CurveProblem.tested(own, before, half, among)
+    assert value == pytest.approx(-np.log(rms(errors["b"][:, both])).mean())
+    ground.tests = {"none"}
+    assert CurveProblem.tested(own, before, half, among) == 0.0
+    own.score = lambda tried, among: 2.5
+    own.tested = lambda before, tried, among: 0.25
+    assert CurveProblem.left(own, before, half, among) == 2.75
+    own.faint = True
+    faint = CurveProblem.change(own, before, tried(0.5))
+    assert faint["a"] == pytest.approx(np.log(0.5) / 0.25) and faint["b"] == pytest.approx(np.log(0.5) / 0.25)
+
+
+def test_logs_and_other_subsystems_may_speak_against_a_curve() -> None:
+    from vaneloop.identification.unmodelled import problem
+    from vaneloop.identification.unmodelled.problem import CurveProblem
+
+    decided: list[Any] = []
+    verdicts: dict[str, bool] = {}
+
+    def decide(rules: Any, case: Any, names: Any, before: Any) -> bool:
+        kind = {id(problem.NEAR_NOISE): "near", id(problem.OTHER_LOGS): "logs"}.get(id(rules), "elsewhere")
+        decided.append((kind, names, before))
+        return verdicts.get(kind, True)
+
+    own: Any = SimpleNamespace(
+        faint=False, decisions=SimpleNamespace(decide=decide), change=lambda before, tried: {"a": 0.5, "t": 0.25},
+        ground=SimpleNamespace(tests=frozenset({"t"}), elsewhere=lambda curves, theta: {"linkage": 0.75}),
+    )  # fmt: skip
+    before = SimpleNamespace(names=("one",), errors=None)
+    tried = SimpleNamespace(names=("one", "two"), errors=None, curves=(), fit=SimpleNamespace(theta=0))
+    assert CurveProblem.objection(own, before, tried) == ""
+    assert [d[0] for d in decided] == ["logs", "elsewhere"] and decided[0][1:] == (("one", "two"), ("one",))
+    verdicts["elsewhere"] = False
+    assert "linkage" in CurveProblem.objection(own, before, tried)
+    verdicts["logs"] = False
+    said = CurveProblem.objection(own, before, tried)
+    assert said and "linkage" not in said
+    decided.clear()
+    own.faint, verdicts["logs"] = True, True
+    before.errors = tried.errors = {"a": np.ones((1, 50)), "t": np.ones((1, 50))}
+    CurveProblem.objection(own, before, tried)
+    assert [d[0] for d in decided] == ["near", "logs", "elsewhere"]
