@@ -128,7 +128,8 @@ class Ran:
             code = int(e.code or 0)
         said = self.capsys.readouterr()
         self.out += ["", f"$ vaneloop {' '.join(words)}"]
-        self.out += [re.sub(r"[\s─╷╵┃│╶╴]+", " ", line).strip() for line in said.out.splitlines()]
+        lines = [re.sub(r"[\s─╷╵┃│╶╴]+", " ", line).strip() for line in said.out.splitlines()]
+        self.out += [x for x in lines if not re.match(r"compiling .*\(once, about", x)]  # where nothing is compiled yet
         self.out += [f"! {line}" for line in said.err.splitlines()]
         self.out += self.pages
         self.pages.clear()

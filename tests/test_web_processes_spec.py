@@ -123,7 +123,9 @@ def test_a_question_is_answered_and_its_progress_told(monkeypatch: pytest.Monkey
         assert await first == [1, 2]
         with pytest.raises(WorkError, match=r"^no such file$"):
             await second
+        w.loading = "compiling"
         w.stop()
+        assert w.loading == ""
         with pytest.raises(Cancelled, match="stopped"):
             await third
         assert w.process is None and not w.jobs and killed == [NOBODY]
@@ -1193,6 +1195,7 @@ def serving(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, visit: Callable[[Any, SimpleNamespace], Any], loopback: bool = True
 ) -> SimpleNamespace:
     """Serve a folder; ``visit`` it instead of waiting for Ctrl-C. What the server made."""
+    from nicegui import Client
     from nicegui.testing.general import nicegui_reset_globals
 
     from vaneloop.web import server
@@ -1258,7 +1261,10 @@ def serving(
     before = {n: (x.handlers, x.propagate) for n, x in loggers.items()}
     try:
         with nicegui_reset_globals():
-            server.serve(sock, folder, "t" * 20, 1000, loopback, seen.words.append, None, None)
+            try:
+                server.serve(sock, folder, "t" * 20, 1000, loopback, seen.words.append, None, None)
+            finally:
+                Client.page_routes.clear()  # else the modules of the pages are forgotten, and imported anew
     finally:
         sock.close()
         for n, (handlers, propagate) in before.items():
