@@ -27,6 +27,8 @@ from hil.loop.realtime import Lateness
 from tests.page_outline import approve, digest
 from tests.test_page_outlines import TESTED, diagnosis, fit_of, learned, stage, surface
 from vaneloop.base import terminal
+from vaneloop.base.errors import InputError
+from vaneloop.base.tables import path
 from vaneloop.cli import clearance, main
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.regimes import locate
@@ -43,6 +45,7 @@ def taken(parser: argparse.ArgumentParser, at: str = "") -> Iterator[str]:
     for group in parser._action_groups:
         for a in group._group_actions:
             if isinstance(a, argparse._SubParsersAction):
+                yield f"{at}{a.dest}: parts, required {a.required}, by {a._parser_class.__name__}"
                 for name, part in a.choices.items():
                     yield f"{at}{name}:"
                     yield from taken(part, f"{at}  ")
@@ -260,7 +263,10 @@ def test_a_run_is_replayed(ran: Ran, log: str) -> None:
     assert ran("replay", log, "--tolerance", "x_lvdt=0.001", "--strategy", "single", "--out", "m.blf", *J) == 1
     assert ran("replay", log, "--tolerance", "x_lvdt.max_abs=50", "--quiet") == 0
     assert ran("replay", log, "--strategy", "none") == 2
-    (ran.folder / "test.toml").write_text('t = { values = [0.0, 5.0, 20.0], unit = "s", origin = "x" }\n')
+    own = ran.folder / "tables"
+    own.mkdir()
+    (own / "calibration.toml").write_text(path("calibration.toml").read_text(encoding="utf-8"))
+    assert ran("replay", log, "--tables", "tables", "--quiet") == 0 and ran("replay", log, "--tables", "tables") == 0
     approve("cli_replay", ran.text())
 
 
@@ -305,7 +311,7 @@ def test_an_engine_is_scheduled(ran: Ran) -> None:
 
 def test_files_of_a_machine(ran: Ran) -> None:
     assert ran("design", "--kp", "-1") == 2 and ran("design", "--ki", "1.1e6") == 2
-    ran("a2l", "--out", "f.a2l", *J)
+    ran("a2l", "--out", "f.a2l", *J, files=("f.a2l",))
     assert ran("new-controller", "mine", *J) == 0 and ran("new-controller", "mine") == 2
     (ran.folder / "file").write_text("x")
     (ran.folder / "empty").mkdir()
@@ -1419,3 +1425,182 @@ def test_options_are_offered_where_they_count() -> None:
     parser = argparse.ArgumentParser()
     options.add_tables_option(parser, plant=False)
     assert {a.dest for a in parser._actions} == {"help", "tables"}
+
+
+# ---- how far it is, and the ends of what is allowed ------------------------------------------------------------------
+
+
+def test_a_bar_goes_from_nothing_to_all(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
+    from vaneloop.cli import engine_test
+
+    bars: list[tuple[str, list[float]]] = []
+
+    @contextmanager
+    def bar(args: Any, text: str) -> Iterator[Callable[..., None]]:
+        bars.append((text, []))
+        yield lambda fraction, *_: bars[-1][1].append(float(fraction))
+
+    monkeypatch.setattr(terminal, "progress_bar", bar)
+    assert ran("inject", "demand_gap_40ms", "mode_request_insane", "--quiet") == 0
+    assert ran("run", "--bus", "lockstep", "--duration", "0.5", "--quiet") == 0
+    assert ran("fuzz", "--frames", "400", "--quiet") == 0
+    result = SimpleNamespace(
+        signals=[SimpleNamespace(signal="vigv", samples=9, **dict.fromkeys(engine_test.STATISTICS, 0.001))],
+        simulated_s=3164.0, wall_s=2.0, model={},
+    )  # fmt: skip
+    asked: list[Any] = []
+
+    def tested(n_dem: Any, strategy: str, seed: int, width: Any, progress: Any, *more: Any) -> Any:
+        progress(1.0)
+        asked.append((strategy, seed, width))
+        return result
+
+    monkeypatch.setattr(engine_test, "engine_test", tested)
+    monkeypatch.setattr(engine_test, "replay_json", lambda r: {})
+    monkeypatch.setattr(
+        engine_test, "engine_test_report", lambda one, two, paper, path, command: f"{path} of {command}"
+    )
+    monkeypatch.setattr(engine_test, "apart", lambda model: ["vanes are apart"])
+    monkeypatch.setattr(engine_test, "warm_up", lambda say: say("compiled"))
+    words = ("--strategy", "inverse", "--report", "e.html", "--hysteresis", "10", "--seed", "0")
+    assert ran("engine-test", *words) == 0
+    assert asked == [(s, 0, 10.0) for s in ("single", "dual", "inverse")]
+    assert "page: e.html of vaneloop engine-test --strategy inverse --report e.html --hysteresis 10 --seed 0" in ran.out
+    assert {"single: vanes are apart", "inverse: vanes are apart", "compiled"} <= set(ran.out)
+    assert [text for text, _ in bars] == ["injecting", "lockstep", "frames", *(f"engine test, {a[0]}" for a in asked)]
+    for text, shares in bars:
+        assert shares and (np.diff(shares) >= 0.0).all() and shares[0] >= 0.0 and shares[-1] <= 1.0, text
+    injecting = bars[0][1]
+    assert injecting[0] < 0.5 < injecting[-1] and max(s for s in injecting if s <= 0.5) > 0.4
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["strategies", "--play", "5", "--growth", "2", "--noise", "20", "--dither", "1", "--dwell", "10"],
+        ["fleet", "run", "x", "--out", "R", "--workers", "10000", "--limit", "1e6", "--patience", "1e5"],
+        ["fleet", "run", "x", "--out", "R", "--workers", "1", "--limit", "0.001", "--patience", "0.5"],
+        ["campaign", "p", "--out", "R", "--workers", "10000", "--limit", "1e6", "--patience", "1e5"],
+        ["campaign", "p", "--out", "R", "--workers", "1", "--limit", "0.001", "--patience", "0.5"],
+        ["diagnose", "x", "--workers", "64"], ["diagnose", "x", "--workers", "1"],
+        ["fuzz", "--frames", "1", "--seed", str(2**63 - 1), "--recovery", "3600"], ["fuzz", "--current-limit", "1000"],
+        ["fuzz", "--frames", "1", "--seed", "0", "--recovery", "0.01", "--stroke-limit", "1000"],
+        ["run", "--bus", "x", "--limit-late-us", "0", "--limit-share", "99.9", "--start-speed", "120", "--seed", "0"],
+        ["run", "--bus", "x", "--start-speed", "0", "--spin-us", "1000", "--realtime-priority", "99"],
+        ["run", "--bus", "x", "--duration", "1e7"],
+        ["run", "--bus", "x", "--spin-us", "0", "--realtime-priority", "1", "--xcp", "--tool-seed", str(2**63 - 1)],
+        ["inject", "x", "--seed", "0"], ["design", "--kp", "1e6", "--ki", "0"], ["engine-test", "--hysteresis", "0"],
+    ],
+)  # fmt: skip
+def test_what_stands_at_the_end_of_what_is_allowed_is_taken(
+    ran: Ran, words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Enough(Exception):
+        """It has been taken."""
+
+    def taken(*_: Any, **__: Any) -> Any:
+        raise Enough
+
+    where = {
+        "strategies": ["options.tables_of"], "fleet": ["terminal.pairs"], "campaign": ["known"],
+        "diagnose": ["own_model.asked"], "fuzz": ["options.machine_of"],
+        "run": ["attended.check_service_options"],
+        "inject": ["load_scenario"], "engine_test": ["load_profile"],
+    }  # fmt: skip
+    name = words[0].replace("-", "_")
+    for at in where.get(name, []):
+        monkeypatch.setattr(f"vaneloop.cli.{name}.{at}", taken)
+    monkeypatch.setattr("vaneloop.design.servo_design.evaluate", taken)
+    module = importlib.import_module(main.COMMANDS[words[0]][0])
+    parser = terminal.Parser(prog=words[0])
+    module.add_options(parser)
+    command = getattr(module.command, "__wrapped__", module.command)
+    with pytest.raises(Enough):
+        command(parser.parse_args(words[1:]))
+
+
+def test_frames_are_compiled_for_only_where_a_log_has_some(monkeypatch: pytest.MonkeyPatch) -> None:
+    from vaneloop.cli import options
+
+    asked: list[Any] = []
+    monkeypatch.setattr(options, "warm_up", lambda say: say("compiling") or asked.append(1))
+    monkeypatch.setattr(terminal, "say", lambda args, text: asked.append(text))
+    for log, begun in (("a.csv", []), ("a.parquet", []), ("a.blf", ["compiling", 1]), ("a.log", ["compiling", 1])):
+        asked.clear()
+        options.warm_up_for(argparse.Namespace(log=log))
+        assert asked == begun
+
+
+def test_a_scenario_that_cannot_be_is_left_out_among_others(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
+    from vaneloop.cli import inject
+
+    asked: list[str] = []
+    monkeypatch.setattr(inject, "lacks", lambda scenario, plant: "no such part")
+
+    def run(scenario: Any, name: str, **more: Any) -> Any:
+        asked.append(name)
+        raise InputError("it lacks a part")
+
+    monkeypatch.setattr(inject, "run", run)
+    assert ran("inject", "demand_stops") == 2 and asked == ["demand_stops"]
+    assert ran("inject", "demand_stops", "nominal") == 0 and len(asked) == 1
+    assert "skipped: nominal: no such part" in ran.out
+
+
+def test_a_record_is_complete_whatever_ends_the_run(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    from vaneloop.cli import station
+
+    closed: list[int] = []
+    kept = ["old.log"]
+
+    class Recorder:
+        def __init__(self, path: str, channel: str):
+            closed.append(0)
+            self.kept, self.of = kept[0], (path, channel)
+
+        def close(self) -> None:
+            closed[-1] += 1
+
+    monkeypatch.setattr(station, "RecorderProcess", Recorder)
+    args = argparse.Namespace(record="r.log", quiet=False, json=None)
+    with pytest.raises(ValueError, match="x"), station.recording(args, "local:x") as recorder:
+        assert recorder.of == ("r.log", "local-x") and closed == [0]
+        raise ValueError("x")
+    assert closed == [1] and "r.log was there already: it is now old.log" in capsys.readouterr().out
+    kept[0] = ""
+    with station.recording(args, "x"):
+        pass
+    assert closed == [1, 1] and capsys.readouterr().out == ""
+    with station.recording(argparse.Namespace(record=None), "x") as none:
+        assert none is None
+
+
+def test_what_names_a_machine_and_a_log_reaches_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    from vaneloop.cli import options
+
+    monkeypatch.setattr(options, "Machine", lambda *given: given)
+    args = argparse.Namespace(tables="T", model="m.toml", plant="p", controller="c.so")
+    assert options.machine_of(args, strategy="dual") == ("T", "m.toml", "dual", "p", "c.so")
+    assert options.machine_of(args, "other") == ("T", "other", None, "p", "c.so")
+    assert options.machine_of(argparse.Namespace(model="")) == (None, None, None, None, None)
+    order: list[Any] = []
+    monkeypatch.setattr(options, "log_options", lambda args: {"part": 3})
+    monkeypatch.setattr(options, "warm_up_for", order.append)
+    monkeypatch.setattr(options, "read_log", lambda log, **more: order.append((log, more)) or "the log")
+    args = argparse.Namespace(log="a.blf")
+    assert options.read_log_of(args, require=("x",)) == "the log"
+    assert order == [args, ("a.blf", {"part": 3, "require": ("x",)})]
+
+
+def test_a_model_of_one_s_own_is_compared_without_a_loop(ran: Ran, log: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from vaneloop.cli import compare
+
+    shown: list[Any] = []
+    monkeypatch.setattr(compare.own_model, "asked", lambda args: True)
+    monkeypatch.setattr(compare.own_model, "ask", lambda args, verb: shown.append(verb) or Answered(by_log="the logs"))
+    monkeypatch.setattr(compare.own_model, "show", lambda args, by_log: shown.append(by_log))
+    assert ran("compare", log, "--report", "p.html", *J) == 0 and shown == ["compare", "the logs"]
+    assert (
+        "So it is." in ran.out and "page: p.html of vaneloop compare run.csv --report p.html --json j.json" in ran.out
+    )
+    assert "  answer 1" in ran.out

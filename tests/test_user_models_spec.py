@@ -1983,3 +1983,28 @@ def test_stops_give_energy_where_their_weights_have_both_signs() -> None:
     assert share(3.0, -1.0, 1.0) == pytest.approx(0.2, abs=0.02)
     assert share(-3.0, 1.0) == pytest.approx(0.25, abs=0.02)
     assert share_given_back(0.0, 2.0, np.zeros(9)) == np.inf
+
+
+def test_what_a_simulation_is_told_of_its_surfaces() -> None:
+    courses = {"v": np.arange(4.0), "w": np.arange(4.0) ** 2}
+    data: Any = SimpleNamespace(column=lambda log, name: courses[name])
+    small, large = np.arange(9.0).reshape(3, 3), np.arange(25.0).reshape(5, 5)
+
+    def surface(how: str, of: int, name: str, second: int, other: str, table: Array) -> terms.Surface:
+        return terms.Surface(how, 1, of, name, 0.0, 2.0, lambda _: table, of_second=second, second=other,
+                             low_second=-1.0, high_second=3.0)  # fmt: skip
+
+    first = surface("output adds", terms.COLUMN, "v", 0, "x", small)
+    other = surface("state adds", terms.INPUT + 1, "u", terms.COLUMN, "w", large)
+    both = [(first, small), (other, large)]
+    how, place, of, low, high, tables, columns = terms.surfaces_for_kernel(both, data, 0, 3)
+    assert how.tolist() == [5, 4] and place.tolist() == [1, 1]
+    assert of.tolist() == [[terms.COLUMN, 0], [terms.INPUT + 1, terms.COLUMN + 1]]
+    assert low.tolist() == [[0.0, -1.0]] * 2 and high.tolist() == [[2.0, 3.0]] * 2
+    assert columns.tolist() == [courses["v"][:3].tolist(), courses["w"][:3].tolist()]
+    assert tables[1].tolist() == large.tolist() and tables[0][::2, ::2] == pytest.approx(small)
+    assert tables[0][1, 1] == pytest.approx(0.25 * small[:2, :2].sum())
+    assert first.at(np.array([[0.0, 2.0, 9.0], [-1.0, 1.0, 3.0]]), small) == pytest.approx([0.0, 7.0, 8.0])
+    curve = terms.Curve("output adds", 0, terms.INPUT, "u", 0.0, 1.0, lambda v: v)
+    assert [[c for c, _ in part] for part in terms.apart([(curve, small[0]), *both])] == [[curve], [first, other]]
+    assert other.value(lambda number, name: np.array([number])).tolist() == [[terms.INPUT + 1], [terms.COLUMN]]

@@ -27,7 +27,7 @@ from vaneloop.identification.settings import COLOUR
 from vaneloop.identification.subsystem import Array, Parameter, Stage
 from vaneloop.identification.unmodelled.regressors import Quantity
 from vaneloop.identification.user_models.terms import COLUMN
-from vaneloop.identification.vane_chain import candidates, demand, experiment
+from vaneloop.identification.vane_chain import candidates, demand, experiment, resample
 from vaneloop.identification.vane_chain.actuator import _quadratic_drag
 from vaneloop.identification.vane_chain.alignment import (
     Late,
@@ -1694,3 +1694,30 @@ def test_a_controller_of_the_user_s_own_has_no_servo_that_is_known(
     said = "a controller of your own gives its current for its own demand, not for the logged one"
     assert c.not_observed["servo"] == said
     assert "ticks" not in driven_of(c.stage("actuator")).columns
+
+
+def test_speed_is_that_of_a_fifth_of_a_second_and_a_turn_begins_anew() -> None:
+    gaps: Any = SimpleNamespace(far={"p_s"}, fresh=lambda names: np.arange(400)[None] < 300)
+    for dt, k in ((0.01, 10), (0.05, 3)):
+        t = dt * np.arange(400)
+        turn = t[200]
+        columns = {"x_lvdt": 5.0 * np.abs(t - turn), "n_r": 60.0 + t, "p_s": 20.0 + t, "i_cmd": t, "vigv": t}
+        got, units = resample.regimes_of(t, columns, gaps)
+        v = got["stroke speed"]
+        assert abs(v[200]) < 2.5 and abs(v[200 + k // 2]) < 4.0 < v[203 + k]
+        assert v[230:380] == pytest.approx(5.0, rel=0.05) and v[20:180] == pytest.approx(-5.0, rel=0.05)
+        assert got["direction"][[100, 300]].tolist() == [-1.0, 1.0] and got["time"] is t
+        way = got["distance since reversal"]
+        assert way[150] == pytest.approx(5.0 * t[150], rel=0.05)
+        assert way[300] == pytest.approx(5.0 * (t[300] - turn), rel=0.1)
+        assert np.isnan(got["supply pressure"][300:]).all() and not np.isnan(got["supply pressure"][:300]).any()
+        assert units == {
+            "time": "s", "stroke": "mm", "stroke speed": "mm/s", "direction": "", "distance since reversal": "mm",
+            "rotor speed": "%", "supply pressure": "MPa", "current": "mA",
+        }  # fmt: skip
+    slow, _ = resample.regimes_of(t, {"x_lvdt": 20.0 + 0.19 * t}, gaps)
+    assert not slow["direction"].any() and set(slow) == {
+        "time", "stroke", "stroke speed", "direction", "distance since reversal",
+    }  # fmt: skip
+    known, _ = resample.regimes_of(t, {"x_lvdt": t}, SimpleNamespace(far={"x_lvdt"}, fresh=gaps.fresh))  # type: ignore[arg-type]
+    assert all(np.isnan(known[n][300:]).all() for n in known if n != "time") and not np.isnan(known["time"]).any()

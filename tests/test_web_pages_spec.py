@@ -457,6 +457,7 @@ def test_a_run_in_lockstep(monkeypatch: pytest.MonkeyPatch, session: Session) ->
         worker.held[0].set_result({})
         worker.jobs.clear()
         await t.note("ended")
+        assert lp.recorded.marks == ((pytest.approx(20.0 - 0.01), "babbling_idiot"),)
         await t.click("Open in missing physics")
         approve("web_run", t.text())
 
@@ -478,6 +479,7 @@ def test_a_run_in_real_time(monkeypatch: pytest.MonkeyPatch, session: Session) -
         lp.workers["node"].news({"late": figures, "histogram": [("< 10", 5), ("< 100", -1)]})
         await t.tick("news")
         await t.tick("nothing new")
+        assert lp.clock == 90.0
         await t.click("bit_flips")
         lp.tell(demand=1.0)
         lp._calibrate(3, [b"x"])

@@ -483,6 +483,8 @@ def test_a_view_has_what_is_asked_for_and_one_sample_to_each_side() -> None:
     }  # fmt: skip
     assert (head["span"], head["key"], head["near"]) == ([0.0, 99.0], "key", 40.0)
     assert head["marks"] == [[5.0, "gust"]] and head["bands"] == [[1.0, 2.0, "RUN", "bad"]]
+    for start, end in ((0.0, 3.0), (-9.0, 3.0), (0.5, 3.0)):
+        assert unpacked_view(view(curves, start, end, 500))[1][0].tolist() == [0.0, 1.0, 2.0, 3.0]
     whole, lines = unpacked_view(view(curves, None, None, 500))
     assert [p["n"] for p in whole["panels"]] == [100, 10, 0] and lines[3].tolist() == (t[10:20] * 2.0).tolist()
     assert unpacked_view(view(Curves(), None, None, 1))[0]["span"] == [0.0, 1.0]
@@ -692,6 +694,18 @@ def test_the_loop_is_driven_by_what_is_told(monkeypatch: pytest.MonkeyPatch) -> 
     assert same == answer and len(again) == len(news)
     _, other, _ = lockstep_of(monkeypatch, told, seed=None)
     assert other["state_hash"] != answer["state_hash"]
+
+
+def test_a_profile_goes_on_every_ten_ticks_from_when_it_was_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    curve = builtin("sine").per_frame()[:, 0]
+    news, answer, _ = lockstep_of(monkeypatch, [{}, {}], profile="sine")
+    said = [n for n in news if isinstance(n, dict) and "rows" in n]
+    ticks = round(1000 * answer["simulated_s"])
+    each = ticks // len(said)
+    assert [n["n_dem"] for n in said] == [curve[(each * (k + 1) - 1) // 10] for k in range(len(said))]
+    news, _, _ = lockstep_of(monkeypatch, [{}, {"profile": "sine"}, {}])
+    said = [n for n in news if isinstance(n, dict) and "rows" in n]
+    assert [n["n_dem"] for n in said[2:]] == [curve[(each * (k + 1) - 1) // 10] for k in range(len(said) - 2)]
 
 
 def test_the_loop_keeps_the_pace_that_is_asked(monkeypatch: pytest.MonkeyPatch) -> None:
