@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
+from controller.channels import PAIR_SCALARS
 from controller.monitors import FAR
 from controller.records import (
     INPUT_FIELDS,
@@ -21,7 +22,7 @@ from controller.records import (
     record,
 )
 from vaneloop.base.errors import InputError
-from vaneloop.base.tables import Axis, Bound, Bounded, Quantity, Table, read
+from vaneloop.base.tables import Axis, Bound, Bounded, Quantity, Table, load_toml, path, read
 from vaneloop.base.vanes import VANES, Staged, vane_in
 
 __all__ = ["Calibration", "load_calibration", "new_inputs", "new_outputs", "new_state"]
@@ -34,6 +35,7 @@ SI = {
     "deg": _DEG,
     "deg/s": _DEG,
 }  # mA/mm = A/m and the other ratios need no factor
+DRIVES = ("one", "both")
 
 
 class Calibration(NamedTuple):
@@ -43,12 +45,19 @@ class Calibration(NamedTuple):
     table   float64[4, n]: speed (%), then stroke (m) for extension, retraction and the single mean curve
     angles  float64[1 + stages, m]: stroke (m), then the angle (rad) of each stage at it in the middle of the play
     program a controller of the user's own, to be flashed with it (`hil.native.Program`); None: the firmware here
+    channels  float64[n] of `controller.channels.PAIR_FIELDS`, SI: the firmware runs in two channels; None: in one
     """
 
     k: np.ndarray
     table: np.ndarray
     angles: np.ndarray
     program: Any = None
+    channels: np.ndarray | None = None
+
+    def of_one_channel(self, what: str) -> None:
+        """Refuse two channels: InputError in one line, for ``what`` takes one alone."""
+        if self.channels is not None:
+            raise InputError(f"calibration: channels.number (=2) must be 1 for {what} (docs/channels.md)")
 
     @property
     def vanes(self) -> tuple[str, ...]:
@@ -182,6 +191,52 @@ class Adaptive(Bounded):
     width_limit: Annotated[Quantity, Bound("deg", 0.0, 5.0)]
 
 
+class Channels(Bounded):
+    """How many channels the controller has, and what two do together (`controller.channels`).
+
+    drive  which of two drive the valves: "one", the channel in charge, or "both", half of the current each
+    """
+
+    number: Annotated[Quantity, Bound("-", 1.0, 2.0)]
+    drive: str
+    disagree_limit: Annotated[Quantity, Bound("mm", 0.05, 10.0)]
+    hysteresis: Annotated[Quantity, Bound("mm", 0.0, 10.0)]
+    confirm_time: Annotated[Quantity, Bound("s", 0.001, 10.0)]
+    fade_rate: Annotated[Quantity, Bound("mm/s", 0.1, 1000.0)]
+    rate_gain: Annotated[Quantity, Bound("mm/s/mA", 0.01, 100.0)]
+    rate_lag: Annotated[Quantity, Bound("s", 0.0, 1.0)]
+    model_time: Annotated[Quantity, Bound("s", 0.005, 10.0)]
+    link_timeout: Annotated[Quantity, Bound("s", 0.001, 0.2)]
+    track_time: Annotated[Quantity, Bound("s", 0.0, 10.0)]
+    takeover_time: Annotated[Quantity, Bound("s", 0.001, 10.0)]
+    coil_limit: Annotated[Quantity, Bound("mA", 0.01, 100.0)]
+    coil_time: Annotated[Quantity, Bound("s", 0.001, 10.0)]
+
+    @model_validator(mode="after")
+    def _choices(self) -> Channels:
+        if self.number.value not in (1.0, 2.0):
+            raise ValueError(f"number (={self.number.value:g}) must be 1 or 2")
+        if self.drive not in DRIVES:
+            raise ValueError(f"drive (={self.drive!r}) must be one of {', '.join(DRIVES)}")
+        if not self.hysteresis.value < self.disagree_limit.value:
+            raise ValueError(
+                f"hysteresis (={self.hysteresis.value:g} mm) must be below disagree_limit "
+                f"(={self.disagree_limit.value:g} mm)"
+            )
+        return self
+
+    def flat(self) -> np.ndarray:
+        """Its numbers, float64[n] of `controller.channels.PAIR_FIELDS`, SI."""
+        values = {key: q.value * SI.get(q.unit, 1.0) for key, q in self if isinstance(q, Quantity)}
+        values["both"] = float(DRIVES.index(self.drive))
+        return np.array([values[name] for name in PAIR_SCALARS])
+
+
+def _shipped_channels() -> Channels:
+    """What a calibration table has that says nothing of channels."""
+    return Channels.model_validate(load_toml(path("calibration.toml"))["channels"])
+
+
 class CalibrationTable(Table):
     """``calibration.toml``: every scalar of the controller, by job."""
 
@@ -195,6 +250,7 @@ class CalibrationTable(Table):
     observer: Observer
     inverse: Inverse
     adaptive: Adaptive
+    channels: Channels = Field(default_factory=_shipped_channels)
 
     @model_validator(mode="after")
     def _together(self) -> CalibrationTable:
@@ -316,6 +372,9 @@ class AngleTable(Staged, Bounded):
         return self
 
 
+SECTIONS = tuple(name for name in CalibrationTable.model_fields if name != "channels")  # of the firmware itself
+
+
 class Scalar(NamedTuple):
     """A scalar as ``calibration.toml`` has it: ``si`` turns ``value`` and its bounds, in ``unit``, into SI."""
 
@@ -329,9 +388,11 @@ class Scalar(NamedTuple):
 
 
 def scalars_in(table: CalibrationTable) -> list[Scalar]:
-    """Return the scalars of a calibration table in their order; the choices in words are not among them."""
+    """Return the firmware's scalars of a calibration table in their order; the choices in words, and what channels do
+    together, are not among them.
+    """
     out = []
-    for section in type(table).model_fields:
+    for section in SECTIONS:
         fields = type(getattr(table, section)).model_fields
         for key, q in getattr(table, section):
             if isinstance(q, Quantity):
@@ -345,10 +406,12 @@ def load_calibration(
     strokes: str | Path = "stroke_tables.toml",
     strategy: str | None = None,
     angles: str | Path = "vane_angles.toml",
+    channels: int | None = None,
 ) -> Calibration:
     """Read, check and flatten the controller's tables.
 
     strategy: overrides the table's choice, one of `STRATEGIES`.
+    channels: overrides the table's number of channels, 1 or 2.
     Raises InputError with file, key, value and what is allowed.
     """
     cal = read(calibration, CalibrationTable)
@@ -356,6 +419,8 @@ def load_calibration(
     angle = read(angles, AngleTable)
     if strategy is not None and strategy not in STRATEGIES:
         raise InputError(f"strategy (={strategy!r}) must be one of {', '.join(STRATEGIES)}")
+    if channels not in (None, 1, 2):
+        raise InputError(f"channels (={channels}) must be 1 or 2")
     values = {
         "strategy": float(STRATEGIES.index(strategy or cal.schedule.strategy)),
         "table_input": 0.0 if cal.schedule.table_input == "n_r" else 1.0,
@@ -369,7 +434,8 @@ def load_calibration(
         + [np.multiply(getattr(stroke, r).values, 1e-3) for r in ("extension", "retraction", "single")]
     )
     vanes = [np.array(angle.stroke.values) * 1e-3, *(np.deg2rad(getattr(angle, s).values) for s in angle.vanes)]
-    return Calibration(k, table, np.array(vanes))
+    many = channels if channels is not None else int(cal.channels.number.value)
+    return Calibration(k, table, np.array(vanes), None, cal.channels.flat() if many == 2 else None)
 
 
 def new_inputs() -> np.ndarray:

@@ -24,7 +24,7 @@ from vaneloop.base.vanes import VANES, own_rows
 __all__ = [
     "FAULTS", "FAULT_FIELDS", "INPUTS", "INPUT_FIELDS", "MODES", "OBSERVABLE_FIELDS", "OUTPUTS", "OUTPUT_FIELDS",
     "SCALARS", "SCALAR_FIELDS", "STATE", "STATE_FIELDS", "STRATEGIES", "Field", "Record", "as_inputs", "as_outputs",
-    "as_scalars", "as_state", "flat", "flat_names", "kind", "record", "state_rows",
+    "as_scalars", "as_state", "flat", "flat_names", "kind", "record", "state_rows", "viewer",
 ]  # fmt: skip
 
 _array: Any = make_array  # what has no types
@@ -258,7 +258,7 @@ def flat(of: Record) -> np.ndarray:
     return np.asarray(of.base).view(np.float64).reshape(-1)
 
 
-def _viewer(fields: tuple[Field, ...]) -> Callable[[Any], Record]:
+def viewer(fields: tuple[Field, ...]) -> Callable[[Any], Record]:
     """Function, compiled too, that shows a row of numbers as the record of ``fields``, and a record as it is."""
     layout = kind(fields)
 
@@ -293,4 +293,4 @@ def _viewer(fields: tuple[Field, ...]) -> Callable[[Any], Record]:
     return view
 
 
-as_inputs, as_outputs, as_scalars, as_state = map(_viewer, (INPUT_FIELDS, OUTPUT_FIELDS, SCALAR_FIELDS, STATE_FIELDS))
+as_inputs, as_outputs, as_scalars, as_state = map(viewer, (INPUT_FIELDS, OUTPUT_FIELDS, SCALAR_FIELDS, STATE_FIELDS))

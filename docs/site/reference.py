@@ -397,8 +397,10 @@ def laws_page() -> str:
 
 def scenarios_page() -> str:
     """The scenarios that ship."""
-    rows = [(f"`{name}`", s.title, s.why, f"{s.duration:g} s") for name in library() for s in [load_scenario(name)]]
+    both = library() | library(2)
+    rows = [(f"`{name}`", s.title, s.why, f"{s.duration:g} s") for name in both for s in [load_scenario(name)]]
     return (
         f"# Scenarios of injection\n\n{MADE}\n\n`vaneloop inject NAME` runs one, `vaneloop inject --all` all. "
+        "Those that begin with `cha_` are of [two channels](../channels.md). "
         "[Injection](../injection.md) says how to write your own.\n\n" + table(("name", "title", "why", "lasts"), rows)
     )

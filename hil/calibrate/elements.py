@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from controller import STRATEGIES, Calibration
-from controller.calibration import SI, AngleTable, CalibrationTable, StrokeTable
+from controller.calibration import SECTIONS, SI, AngleTable, CalibrationTable, StrokeTable
 from controller.records import SCALAR_FIELDS, SCALARS
 from vaneloop.base.files import write_all
 from vaneloop.base.tables import Bound
@@ -81,8 +81,8 @@ class Curve(NamedTuple):
 def _bounds() -> dict[str, tuple[str, str, Bound]]:
     """Scalar -> its section, its table, its bound."""
     out: dict[str, tuple[str, str, Bound]] = {}
-    for section, field in CalibrationTable.model_fields.items():
-        kind: Any = field.annotation
+    for section in SECTIONS:
+        kind: Any = CalibrationTable.model_fields[section].annotation
         for key, of in kind.model_fields.items():
             for bound in of.metadata:
                 if isinstance(bound, Bound):

@@ -29,6 +29,7 @@ from hil.calibrate.errors import DENIED, NO_PAGE, PROTECTED, RANGE, Refusal
 from hil.calibrate.prepare import AtOnce, Desk, Task
 from hil.loop.node import Node
 from hil.native.program import own_scalars
+from vaneloop.base.errors import InputError
 
 __all__ = ["CALIBRATION", "EXACT", "INPUTS", "SHORT", "Memory", "Refusal", "Signal"]
 
@@ -65,6 +66,10 @@ class Memory:
     """
 
     def __init__(self, node: Node):
+        if node.loop.pair:
+            raise InputError(
+                "calibration: channels.number (=2) must be 1 for calibration and service tools (docs/channels.md)"
+            )
         # the tables may be another node's too: what is changed here is this node's own
         built = node.loop.built._replace(
             **{key: getattr(node.loop.built, key).copy() for key in ("k", "table", "angles")}

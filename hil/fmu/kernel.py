@@ -184,8 +184,8 @@ def entry(part: str, shape: Shape) -> Callable[..., None]:
             _view(m, o_in, (n_in,)),
             _view(m, o_out, (n_out,)),
             _view(m, o_z, (n_z,)),
-            Calibration(_view(m, o_bk, (n_k,)), _view(m, o_bt, (4, points)), angles, None),
-            Calibration(_view(m, o_k, (n_k,)), _view(m, o_t, (4, points)), angles, None),
+            Calibration(_view(m, o_bk, (n_k,)), _view(m, o_bt, (4, points)), angles, None, None),
+            Calibration(_view(m, o_k, (n_k,)), _view(m, o_t, (4, points)), angles, None, None),
             _view(m, o_flash, (3,)),
             _view(m, o_s, (n_s, 1)),
             _view(m, o_p, (n_p, 1)),
@@ -198,6 +198,7 @@ def entry(part: str, shape: Shape) -> Callable[..., None]:
             _view(m, o_in, (0,)),
             _view(m, o_in, (0,)),
             _view(m, o_sent, (n_sent, 4)),
+            (),
             (),
         )
 

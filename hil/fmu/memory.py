@@ -83,6 +83,7 @@ def first(plant: Plant, calibration: Calibration) -> tuple[Shape, np.ndarray]:
     neutral. Raises InputError for a machine with two actuators.
     """
     plant.of_one_actuator("an FMU")
+    calibration.of_one_channel("an FMU")
     shape = Shape(len(plant.vanes), calibration.table.shape[1], calibration.angles.shape[1])
     places = places_of(shape)
     m = np.zeros(places["end"].at)

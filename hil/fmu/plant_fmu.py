@@ -143,6 +143,7 @@ class PlantNode(Node):
         self, fmu: PlantFmu, plant: Plant, calibration: Calibration, *, n_r: float = 60.0, seed: int | None = None
     ):
         plant.of_one_actuator("a plant that is an FMU")
+        calibration.of_one_channel("a plant that is an FMU")
         super().__init__(plant, calibration, n_r=n_r, seed=seed)
         self.fmu = fmu
         self.loop.p[LVDT_STEP, 0] = 0.0  # the FMU's converter has its own

@@ -23,6 +23,7 @@ __all__ = [
     "AnyAction",
     "Babble",
     "BusOff",
+    "ChannelFault",
     "Corrupt",
     "Delay",
     "Drop",
@@ -31,6 +32,7 @@ __all__ = [
     "Flood",
     "Frame",
     "Freeze",
+    "Link",
     "Machine",
     "Number",
     "OnBus",
@@ -341,7 +343,7 @@ class BusOff(OnBus):
 
 class Machine(Action):
     """The machine itself: supply pressure ``p_s`` (MPa), oil temperature ``t_oil`` (degC), an ``effect`` and its
-    ``parameters``.
+    ``parameters``; of two actuators the effect of one ``side`` alone.
     """
 
     action: Literal["machine"] = "machine"
@@ -349,14 +351,15 @@ class Machine(Action):
     t_oil: Annotated[Number, Field(ge=-60.0, le=200.0)] | None = None
     effect: str | None = None
     parameters: dict[str, Number] = {}
+    side: Literal["a", "b"] | None = None
 
     @model_validator(mode="after")
     def _known(self) -> Machine:
         if self.effect is None:
             if self.p_s is None and self.t_oil is None:
                 raise ValueError("machine takes p_s, t_oil or effect")
-            if self.parameters:
-                raise ValueError("parameters need an effect")
+            if self.parameters or self.side:
+                raise ValueError(f"{'parameters need' if self.parameters else 'side needs'} an effect")
             return self
         if self.effect not in EFFECTS:
             raise ValueError(f"effect (={self.effect!r}) must be one of {', '.join(EFFECTS)}")
@@ -367,6 +370,33 @@ class Machine(Action):
             q = known[name]
             if not q.low <= value <= q.high:
                 raise ValueError(f"parameters.{name} (={value:g} {q.unit}) must be in [{q.low:g}, {q.high:g}]")
+        return self
+
+
+class ChannelFault(Action):
+    """One of two channels of the controller: it is switched ``off``, and on again at the end; its coil is open or
+    shorted; its LVDT gives nothing (``lvdt_lost``) or the stroke of ``start`` (``lvdt_frozen``).
+    """
+
+    action: Literal["channel"] = "channel"
+    channel: Literal["A", "B"]
+    fault: Literal["off", "coil_open", "coil_short", "lvdt_lost", "lvdt_frozen"]
+
+
+class Link(Action):
+    """The link between two channels: messages come ``delay`` s later, and the share ``loss`` of them is lost (1: all);
+    of those that the ``sender`` sends.
+    """
+
+    action: Literal["link"] = "link"
+    delay: Annotated[Number, Field(ge=0.0, le=0.2)] = 0.0
+    loss: Annotated[Number, Field(ge=0.0, le=1.0)] = 0.0
+    sender: Literal["A", "B", "both"] = "both"
+
+    @model_validator(mode="after")
+    def _does_something(self) -> Link:
+        if self.delay == self.loss == 0.0:
+            raise ValueError("link takes delay or loss")
         return self
 
 
@@ -384,7 +414,9 @@ AnyAction = Annotated[
     | Replay
     | ErrorFrames
     | BusOff
-    | Machine,
+    | Machine
+    | ChannelFault
+    | Link,
     Field(discriminator="action"),
 ]
 ACTIONS: dict[str, type[Action]] = {
@@ -404,5 +436,7 @@ ACTIONS: dict[str, type[Action]] = {
         ErrorFrames,
         BusOff,
         Machine,
+        ChannelFault,
+        Link,
     )
 }

@@ -325,6 +325,8 @@ class Bench:
 
     def _node(self) -> Node:
         plant, calibration = self._made
+        if calibration is not None:
+            calibration.of_one_channel("the fuzzer")
         return Node(plant, calibration, n_r=60.0, seed=0)
 
     def _to_start(self, warm: bool) -> None:

@@ -27,12 +27,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from controller import MODES, STATE, flat, load_calibration
+from controller.channels import SEEN
 from hil.bus import frames
 from hil.bus.port import Port, open_bus
 from hil.inject.actions import (
     ACTIONS,
     Babble,
     BusOff,
+    ChannelFault,
     Corrupt,
     Delay,
     Drop,
@@ -40,6 +42,7 @@ from hil.inject.actions import (
     ErrorFrames,
     Flood,
     Freeze,
+    Link,
     Machine,
     Outsider,
     Override,
@@ -49,14 +52,17 @@ from hil.inject.actions import (
 )
 from hil.inject.any_controller import Reactions, expected_of_any
 from hil.inject.on_lockstep import TICK, OnLockstep, check_stages
-from hil.inject.scenario import COUNTS, Expect, Scenario, library, load_scenario
+from hil.inject.scenario import COUNTS, OF_CHANNELS, Expect, Scenario, library, load_scenario
 from hil.inject.tamper import Intruder
 from hil.inject.verdict import TRANSITIONS, Check, Outcome, Trace, failed, judge, outcome_of
+from hil.loop.pair import seen as seen_of
 from hil.native.isolation import ControllerFailed, isolated
-from plant import build_plant, places
+from plant import Model, build_plant, places
 from plant.effects import EFFECTS
+from plant.model import Side
 from vaneloop.base.errors import InputError
 from vaneloop.base.extras import is_there
+from vaneloop.base.signals import SIDES
 from vaneloop.base.vanes import VANES
 
 if TYPE_CHECKING:
@@ -64,11 +70,9 @@ if TYPE_CHECKING:
     from plant import Plant
 
 __all__ = [
-    "ACTIONS", "TRANSITIONS", "Babble", "BusOff", "Check", "Corrupt", "Delay", "Drop", "Duplicate", "ErrorFrames",
-    "Expect", "Flood",
-    "Freeze", "Machine", "Outcome", "Override", "Reorder", "Replay", "Scenario", "Send", "Trace", "judge", "library",
-    "load_scenario",
-    "run",
+    "ACTIONS", "TRANSITIONS", "Babble", "BusOff", "ChannelFault", "Check", "Corrupt", "Delay", "Drop", "Duplicate",
+    "ErrorFrames", "Expect", "Flood", "Freeze", "Link", "Machine", "Outcome", "Override", "Reorder", "Replay",
+    "Scenario", "Send", "Trace", "judge", "library", "load_scenario", "run",
 ]  # fmt: skip
 
 # ---- lockstep: controller, ECU and bus in simulated time -------------------------------------------------------------
@@ -84,8 +88,14 @@ def _lockstep(
 ) -> Outcome:
     """Run a scenario in simulated time."""
     plant = plant or build_plant()
-    if why := lacks(scenario, plant):
+    if why := lacks(scenario, plant, calibration):
         raise InputError(f"{name}: {why}")
+    if scenario.of_two_actuators:
+        for a in scenario.inject:
+            if isinstance(a, Machine) and a.side is not None:
+                side = Side(effects={str(a.effect): a.parameters})
+                (Model(side_a=side) if a.side == "a" else Model(side_b=side)).check(plant, name)
+        plant = Model(side_a=scenario.side_a, side_b=scenario.side_b).plant(plant)
     started = time.perf_counter()
     check_stages(name, scenario, plant)
     loop = OnLockstep(scenario, plant, calibration)
@@ -93,12 +103,17 @@ def _lockstep(
     z, s = flat(node.loop.state), node.loop.s
     seen = np.array([STATE.index(n) for n in ("mode", "faults", "x_dem", "x_meas", "i_cmd", "n_dem", "n_r_raw")])
     firmware, pots = np.empty((ticks, len(seen))), np.empty((ticks, stages))
+    pair, sides = node.loop.pair, node.loop.sides
+    channels, lvdts = np.empty((ticks, len(SEEN) + 1 if pair else 0)), np.empty((ticks, len(sides)))
     counts = np.empty((ticks, len(COUNTS)), np.int64)
     late = np.zeros((ticks, len(loop.heard)), bool)
     to_border = np.array([1e3, 1e3, 1e3, 1.0, 1.0, *([180.0 / np.pi] * stages)])
     for k in range(ticks):
         loop.tick()
         firmware[k], pots[k] = z[seen], s[places.POT : places.POT + stages, 0]
+        lvdts[k] = sides
+        if pair:
+            channels[k] = (*seen_of(pair), node.loop.given.i_cmd * 1e3)
         counts[k] = loop.counts()
         late[k] = [n in loop.missed for n in loop.heard]
         if progress is not None and k % 1000 == 0:
@@ -109,7 +124,11 @@ def _lockstep(
         np.arange(ticks) * TICK,
         firmware[:, 0].astype(np.int8),
         firmware[:, 1].astype(np.int64),
-        dict(zip(("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", *plant.vanes), signals.T, strict=True)),
+        {
+            **dict(zip(("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", *plant.vanes), signals.T, strict=True)),
+            **dict(zip(SIDES, lvdts.T * 1e3, strict=False)),
+            **dict(zip(OF_CHANNELS, channels.T, strict=False)),
+        },
         dict(zip(COUNTS, counts.T, strict=True)),
         dict(zip(loop.heard, late.T, strict=True)),
         (float(cal.stroke_min) * 1e3, float(cal.stroke_max) * 1e3),
@@ -183,10 +202,14 @@ def cannot(scenario: Scenario) -> str:
     return f"{', '.join(inside)}: no other station on a bus can do that; --bus lockstep can" if inside else ""
 
 
-def lacks(scenario: Scenario, plant: Plant) -> str:
-    """Return what the scenario does to an actuator that this machine does not have, or with a package that is not
-    installed; empty if there is no such thing.
+def lacks(scenario: Scenario, plant: Plant, calibration: Calibration | None = None) -> str:
+    """Return what the scenario does to an actuator that this machine does not have, to channels that its controller
+    does not have, or with a package that is not installed; empty if there is no such thing.
     """
+    if scenario.of_two_channels and (calibration is None or calibration.channels is None):
+        return "is about two channels of the controller: --channels 2 --plant plant_two_actuators.toml has them"
+    if scenario.of_two_actuators and plant.sides != 2:
+        return "is about one of two actuators: --plant plant_two_actuators.toml has them"
     if scenario.secoc and not is_there("cryptography"):
         return "secoc: authentication needs cryptography, which is not installed: pip install 'vaneloop[secoc]'"
     for a in scenario.inject:

@@ -23,13 +23,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hil.inject.scenario import Expect, Scenario
+from hil.inject.scenario import OF_CHANNELS, Expect, Scenario
 from hil.inject.verdict import Facts, Outcome, facts_of
+from vaneloop.base.signals import SIDES
 
 __all__ = ["Margin", "margin_of", "margins", "without_distance"]
 
 _TICK = 1e-3  # s
-_UNITS = {"x_dem": "mm", "x_lvdt": "mm", "i_cmd": "mA", "n_dem": "%", "n_r": "%"}
+_UNITS = {
+    "x_dem": "mm", "x_lvdt": "mm", "i_cmd": "mA", "n_dem": "%", "n_r": "%", **dict.fromkeys(SIDES, "mm"),
+    **dict.fromkeys(("x_select_a", "x_select_b"), "mm"), **dict.fromkeys(("i_a", "i_b", "i_coils"), "mA"),
+    **dict.fromkeys(("link_age_a", "link_age_b"), "ms"),
+    **dict.fromkeys([n for n in OF_CHANNELS if n.startswith(("in_", "ch", "mode", "source", "health"))], "-"),
+}  # fmt: skip
 _BROKEN = 1e-9  # a claim that is broken has a share below zero, also where its distance rounds to nothing
 
 

@@ -11,15 +11,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from controller.channels import CHANNELS
 from hil.bus import frames
 from hil.bus import wire as w
 from hil.bus.lockstep_bus import Channel
 from hil.bus.secoc import Authenticator
 from hil.bus.wire import BITS_PER_TICK, TX_N, put, run_wire, take
-from hil.inject.actions import Action, BusOff, ErrorFrames, Machine, OnBus, OnFrame, Outsider, Replay, identifier
+from hil.inject.actions import (
+    Action,
+    BusOff,
+    ChannelFault,
+    ErrorFrames,
+    Link,
+    Machine,
+    OnBus,
+    OnFrame,
+    Outsider,
+    Replay,
+    identifier,
+)
 from hil.inject.scenario import Scenario
 from hil.inject.tamper import Gateway, Intruder, tick_of
 from hil.loop.node import Ecu, Node
+from hil.loop.pair import COILS, LVDTS, Pair
 from hil.loop.secured import DEMANDED, FROM_CONTROLLER, Secured
 from plant import chain
 from plant.parameters import derive
@@ -64,6 +78,7 @@ class MachineChange:
         self.loop, self.fed, self.engine = node.loop, node.arrays.supply, ecu.arrays
         self.first, self.end = tick_of(action.start), tick_of(action.end)
         self.new = changed_rows(action, node.plant)
+        self.lanes = slice(None) if action.side is None else slice(*{"a": (0, 1), "b": (1, 2)}[action.side])
         self.supply = {i: v for i, v in ((0, action.p_s), (1, action.t_oil)) if v is not None}
         if 0 in self.supply:
             self.supply[0] *= 1e6
@@ -72,7 +87,10 @@ class MachineChange:
     def tick(self, k: int) -> None:
         """Change the machine at the first tick, and back at the end."""
         if k == self.first:
-            self.old = ({r: self.loop.p[r].copy() for r in self.new}, {i: float(self.fed[i]) for i in self.supply})
+            self.old = (
+                {r: self.loop.p[r, self.lanes].copy() for r in self.new},
+                {i: float(self.fed[i]) for i in self.supply},
+            )
             self._set(self.new, self.supply)
         elif k == self.end:
             self._set(*self.old)
@@ -85,8 +103,34 @@ class MachineChange:
             chain.wake(self.loop.s, self.loop.p, 0, self.loop.given.i_cmd)
             for p in (self.loop.p, self.engine.p):
                 for r, v in rows.items():
-                    p[r] = v
+                    p[r, self.lanes] = v
                 derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
+
+
+class PairChange:
+    """What a `ChannelFault` or a `Link` action does to two channels, undone at its end."""
+
+    def __init__(self, action: ChannelFault | Link, pair: Pair):
+        self.first, self.end = tick_of(action.start), tick_of(action.end)
+        self.places: list[tuple[np.ndarray, float]] = []  # numbers of the pair, and what they become
+        if isinstance(action, Link):
+            for side, name in enumerate(CHANNELS):
+                if action.sender in (name, "both"):
+                    self.places += [(pair.line[side, i : i + 1], v) for i, v in enumerate((action.delay, action.loss))]
+        else:
+            part, _, what = action.fault.partition("_")
+            array, kinds = {"coil": (pair.coil, COILS), "lvdt": (pair.lvdt, LVDTS), "off": (pair.power, ("",))}[part]
+            at = CHANNELS.index(action.channel)
+            self.places.append((array[at : at + 1], float(kinds.index(what))))
+        self.old = [float(place[0]) for place, _ in self.places]
+
+    def tick(self, k: int) -> None:
+        """Set them at the first tick, and back at the end."""
+        for (place, new), old in zip(self.places, self.old, strict=True):
+            if k == self.first:
+                place[0] = new
+            elif k == self.end:
+                place[0] = old
 
 
 class Disturber:
@@ -184,6 +228,7 @@ class OnLockstep:
         self.ecu = ecu = Ecu(plant, n_dem=first, seed=scenario.seed + 1)
         actions = scenario.inject
         of = {kind: [a for a in actions if isinstance(a, kind)] for kind in (OnFrame, Outsider, OnBus, Machine)}
+        paired = [a for a in actions if isinstance(a, ChannelFault | Link)]
         chance = [random.Random(f"{scenario.seed} {i}") for i in range(len(of[Outsider]) + 2)]
         self._gateways = [
             Gateway([a for a in of[OnFrame] if sender_of(a) == who], c)
@@ -195,7 +240,10 @@ class OnLockstep:
         both: tuple[Any, Any] = (node, ecu) if keys is None else _secured(node, ecu, keys[0])
         self._vgv, self._demanding = both
         self._intruders = [Intruder(a, c, self._recorded, keys) for a, c in zip(of[Outsider], chance[2:], strict=True)]
-        self._machines = [MachineChange(a, node, ecu) for a in of[Machine]]  # type: ignore[arg-type]
+        self._machines: list[MachineChange | PairChange] = [
+            *(MachineChange(a, node, ecu) for a in of[Machine]),  # type: ignore[arg-type]
+            *(PairChange(a, node.loop.pair) for a in paired),
+        ]
         channel = Channel(seed=scenario.seed)
         self._wire, join = channel.wire, channel.join
         self._stations = {"ECU": join(), "VGV": join()}

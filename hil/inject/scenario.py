@@ -15,17 +15,21 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from controller import FAULTS, MODES
+from controller.channels import SEEN
 from hil.bus.frames import NAMES
-from hil.inject.actions import AnyAction, Number, Positive, Replay, Seconds, Send
+from hil.inject.actions import AnyAction, ChannelFault, Link, Machine, Number, Positive, Replay, Seconds, Send
+from plant.model import Side
 from vaneloop.base.errors import InputError
+from vaneloop.base.signals import SIDES
 from vaneloop.base.tables import Table, read
 from vaneloop.base.vanes import VANES
 
-__all__ = ["COUNTS", "SIGNALS", "Expect", "Scenario", "library", "load_scenario"]
+__all__ = ["COUNTS", "OF_CHANNELS", "SIGNALS", "Expect", "Scenario", "library", "load_scenario"]
 
 # what an expectation can be about, besides mode and faults: signals of the controller in border units, and what its
 # receiver counts
 SIGNALS = ("x_dem", "x_lvdt", "i_cmd", "n_dem", "n_r", *VANES)
+OF_CHANNELS = (*SEEN, "i_coils")  # of two channels
 COUNTS = (
     "good", "sync", "wrong_crc", "repeated", "wrong_sequence", "wrong_length", "wrong_kind", "lost", "refused",
     "unauthentic",
@@ -78,7 +82,7 @@ class Expect(Table):
         kinds = {
             "mode": MODES,
             "fault": (*FAULTS, "any"),
-            "signal": SIGNALS,
+            "signal": (*SIGNALS, *SIDES, *OF_CHANNELS),
             "count": COUNTS,
             "late": tuple(n for n in NAMES.values() if n != "ECU_DEMAND"),
         }
@@ -146,6 +150,7 @@ class Scenario(Table):
     seed       of everything random in it, sensors' noise too
     demand     the ECU's profile: [time (s), n_dem (%)] points, straight lines between them
     secoc      controller and ECU authenticate their frames (docs/bus.md), under a key that ``seed`` gives
+    side_a, side_b  parameters and effects of one of two actuators, from power-on on (`plant.model.Side`)
     inject     actions, in the order in which they act on a frame
     expect     claims; besides them, safe limits and documented mode changes are always demanded
     """
@@ -158,6 +163,8 @@ class Scenario(Table):
         [0.0, 80.0]
     ]
     secoc: bool = False
+    side_a: Side = Side()
+    side_b: Side = Side()
     inject: list[AnyAction] = []
     expect: list[Expect] = []
 
@@ -181,10 +188,22 @@ class Scenario(Table):
                 raise ValueError(f"expect.{i} speaks of {claim.latest:g} s; the scenario ends at {self.duration:g} s")
         return self
 
+    @property
+    def of_two_channels(self) -> bool:
+        """Whether it is about two channels of the controller."""
+        asked = any(isinstance(a, ChannelFault | Link) for a in self.inject)
+        return asked or any(claim.signal in OF_CHANNELS for claim in self.expect)
 
-def library() -> dict[str, Path]:
-    """Return the shipped scenarios: name -> file."""
-    folder = Path(str(resources.files("hil.inject") / "scenarios"))
+    @property
+    def of_two_actuators(self) -> bool:
+        """Whether it is about one of two actuators."""
+        own = self.side_a != Side() or self.side_b != Side()
+        return own or any(isinstance(a, Machine) and a.side for a in self.inject)
+
+
+def library(channels: int = 1) -> dict[str, Path]:
+    """Return the shipped scenarios, of a controller with so many channels: name -> file."""
+    folder = Path(str(resources.files("hil.inject") / ("scenarios" if channels == 1 else "scenarios_of_channels")))
     return {f.stem: f for f in sorted(folder.glob("*.toml"))}
 
 
@@ -193,7 +212,7 @@ def load_scenario(source: str | Path) -> Scenario:
 
     Raises InputError, in one line, naming file, key, value and what is allowed.
     """
-    known = library()
+    known = library() | library(2)
     if isinstance(source, str) and source in known:
         return read(known[source], Scenario)
     if not Path(source).is_file():

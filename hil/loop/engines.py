@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from controller import Calibration, new_state
-from controller.records import DUAL, MODES, SCALAR_FIELDS, STATE, kind
+from controller.records import MODES, SCALAR_FIELDS, STATE, kind
 from hil.loop import cuda as gpu
+from hil.loop.firmware_lanes import runs_in_lanes
 from hil.loop.lanes import lockstep_lanes, loops_of
 from hil.loop.lockstep import CHUNK, S_N_DEM, S_N_R, S_T_OIL, WARM_UP, Run, Stimulus
 from hil.loop.tick import CHANGED_BY, flashed, mean_stroke
@@ -166,7 +167,7 @@ class _Work:
         """Engines that can go side by side: as many stages, tables of one size, the same targets."""
         groups: dict[Any, list[int]] = {}
         differ = {id(cal): cal for cal in self.cals}
-        curves = {i: cal.program is None and bool(cal.scalars.strategy <= DUAL) for i, cal in differ.items()}
+        curves = {i: runs_in_lanes(cal) for i, cal in differ.items()}
         for i, (plant, cal) in enumerate(zip(self.plants, self.cals, strict=True)):
             if curves[id(cal)] and not any(plant.p[row, 0] for row in ELSEWHERE):
                 key = (_stages(plant), cal.table.shape, cal.angles.shape, id(plant.schedules))

@@ -48,8 +48,9 @@ def fields() -> list[tuple[str, Any, tuple[int, ...]]]:
 
 
 def runs_in_lanes(calibration: Calibration) -> bool:
-    """Whether a controller can be in a block: the firmware here, with a strategy of curves."""
-    return calibration.program is None and bool(calibration.scalars.strategy <= DUAL)
+    """Whether a controller can be in a block: one channel of the firmware here, with a strategy of curves."""
+    own = calibration.program is None and calibration.channels is None
+    return own and bool(calibration.scalars.strategy <= DUAL)
 
 
 def place(b: Any, j: int, loop: Loop) -> None:

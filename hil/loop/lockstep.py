@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 
 from controller import STATE, Calibration, load_calibration
 from controller.records import SLOW, as_inputs, as_outputs
+from hil.loop.pair import remember
 from hil.loop.tick import FRAME, Loop, control, hear, mean_current, move, new_loop
 from plant import Plant, build_plant, chain, places
 from vaneloop.base.compiled import compiled_free, is_cached
@@ -170,6 +171,7 @@ def advance(
             for q in range(n_s):
                 for side in range(s.shape[1]):
                     snapshots[i, n_z + side * n_s + q] = s[a.s_rows[q], side]
+            remember(a.pair, snapshots[i], n_z + s.shape[1] * n_s)
         move(k, a, n_dem, n_r, p_s, t_oil)
 
 
@@ -242,8 +244,8 @@ def lockstep(
         noisy=seed is not None,
         pots=pots,
     )
-    state, s = loop.state, loop.s
-    state.direction, state.blend = _starting_curve(loop.calibration, n0, stroke_demand)
+    s = loop.s
+    loop.begin_on(*_starting_curve(loop.calibration, n0, stroke_demand))
     generator = np.random.Generator(np.random.PCG64(seed if seed is not None else 0))
     names = columns_of(machine.vanes, machine.kind == "electromechanical", machine.sides == 2)
     sensors = len(machine.sigma)
@@ -254,7 +256,7 @@ def lockstep(
         machine.place_rings(s, angles, n0, t_oil)
 
     out = np.empty((-(-ticks // every), len(names)))
-    wide = len(loop.z_rows) + loop.s.shape[1] * len(loop.s_rows)
+    wide = len(loop.z_rows) + loop.s.shape[1] * len(loop.s_rows) + (len(loop.pair.memory) if loop.pair else 0)
     buffers = [np.empty((CHUNK if hashed or watch is not None else 0, wide)) for _ in range(2)]
     digest = hashlib.sha256()
     started = time.perf_counter()

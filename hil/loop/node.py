@@ -277,7 +277,8 @@ class Node:
         a, loop = self.arrays, self.loop
         counters = a.counter[: C_ANGLES_2 + (len(loop.angles) - 1) // IN_FRAME]
         receiver = a.receiver if a.receiver[frames.R_UNAUTHENTIC] else a.receiver[: frames.R_UNAUTHENTIC]
-        for part in (loop.z[loop.z_rows], loop.s[loop.s_rows], loop.mean, receiver, counters):
+        pair = (loop.pair.memory,) if loop.pair else ()
+        for part in (loop.z[loop.z_rows], loop.s[loop.s_rows], loop.mean, receiver, counters, *pair):
             digest.update(part.tobytes())
         return digest.hexdigest()
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from controller import Calibration, new_inputs, new_outputs, new_state
 from controller.records import SLOW, Record, as_inputs, as_outputs, as_scalars, as_state, state_rows
-from hil.native.call import firmware
+from hil.loop.pair import controller, new_pair
 from hil.native.program import readable
 from plant import Plant, chain, curve, places
 from plant.effects import CURVES, can_delay, controller_gain_error, frame_hold, schedule_error, trend_threshold_error
@@ -67,10 +67,12 @@ class Loop(NamedTuple):
                  (rad; NaN = not fitted), stage by stage, a row every 10 ms, the last one held
     lvdt         float64[0 or 1] stroke (m) that the controller gets in place of the LVDT's; NaN: the LVDT's
     sides        float64[0, or 2 of two actuators] m, the LVDTs' readings of A and B at this tick; the controller gets
-                 their mean
+                 their mean, two channels one each
     sent         float64[KEPT, 4] contents of good frames: number of the 10 ms in which it came, n_dem, n_r (%),
                  mode_request
     foreign      a controller of the user's own (`hil.native.call.Foreign`); (): the firmware here
+    pair         two channels of it (`hil.loop.pair.Pair`), then ``z``, ``inputs`` and ``outputs`` are those of the one
+                 in charge; (): one channel
     """
 
     inputs: np.ndarray
@@ -91,6 +93,7 @@ class Loop(NamedTuple):
     sides: np.ndarray
     sent: np.ndarray
     foreign: Any = ()
+    pair: Any = ()
 
     @property
     def fed(self) -> Record:
@@ -106,6 +109,11 @@ class Loop(NamedTuple):
     def state(self) -> Record:
         """The firmware's state by name."""
         return as_state(self.z)
+
+    def begin_on(self, direction: float, blend: float) -> None:
+        """Let the controller, each channel of it, begin on a curve: as `controller.records.STATE_FIELDS` have it."""
+        for z in (self.z, *(self.pair.z if self.pair else ())):
+            as_state(z).direction, as_state(z).blend = direction, blend
 
 
 def new_loop(
@@ -124,13 +132,14 @@ def new_loop(
     same_stages(geometry=plant.vanes, vane_angles=calibration.vanes)
     stages = len(plant.vanes)
     cal = flashed(calibration, plant)
+    pair = () if calibration.channels is None else new_pair(plant, calibration)
     foreign = () if calibration.program is None else calibration.program.start(cal)
     stroke = mean_stroke(cal.table, n_r)
     return Loop(
         new_inputs(),
         new_outputs(),
         new_state(),
-        calibration._replace(program=None),
+        calibration._replace(program=None, channels=None),
         cal,
         plant.p[list(CHANGED_BY), 0],
         plant.start(stroke=stroke, n_r=n_engine, t_oil=t_oil),
@@ -145,16 +154,19 @@ def new_loop(
         np.full(plant.sides if plant.sides > 1 else 0, stroke),
         np.full((KEPT, 4), np.nan),
         foreign,
+        pair,
     )
 
 
 def flashed(calibration: Calibration, plant: Plant) -> Calibration:
     """Return the calibration as it is in the controller: with the effects that change its tables and gains."""
     if calibration.program is None:
-        cal = calibration._replace(k=calibration.k.copy(), table=calibration.table.copy())
+        cal = calibration._replace(k=calibration.k.copy(), table=calibration.table.copy(), channels=None)
     else:
         cal = readable(calibration)
-    _flash(calibration._replace(program=None), cal, np.empty(3), plant.p, plant.p[places.SCHEDULE_ERROR, 0])
+    _flash(
+        calibration._replace(program=None, channels=None), cal, np.empty(3), plant.p, plant.p[places.SCHEDULE_ERROR, 0]
+    )
     return cal
 
 
@@ -273,6 +285,8 @@ def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
         inputs.x_lvdt = 0.5 * (a.sides[0] + a.sides[1])
     if a.lvdt.shape[0] > 0 and a.lvdt[0] == a.lvdt[0]:
         inputs.x_lvdt = a.lvdt[0]
+        for side in range(a.sides.shape[0]):
+            a.sides[side] = a.lvdt[0]
     for q in range(a.angles.shape[0]):
         a.angles[q] = s[places.POT + q, 0] + sigma[1 + q] * noise[row, 1 + q]
         inputs.pots[q] = a.angles[q]
@@ -280,7 +294,7 @@ def control(k: int, a: Loop, noise: np.ndarray, row: int, t_oil: float) -> None:
         r = min(max(k // SLOW, 0), a.pots.shape[0] - 1)
         for q in range(a.angles.shape[0]):
             inputs.pots[q] = a.pots[r, 2 * q] * inputs.pots[q] + a.pots[r, 2 * q + 1]
-    firmware(a.inputs, a.outputs, a.z, a.calibration, a.foreign)
+    controller(k, a.inputs, a.outputs, a.z, a.calibration, a.foreign, a.pair, a.sides)
     if p[CURVES, 0] != 0.0:
         out, most = as_outputs(a.outputs), as_scalars(a.calibration.k).current_limit
         bent = out.i_cmd * curve.factor(s, p, 0, curve.SERVO_TIMES) + curve.bend(s, p, 0, curve.SERVO_ADDS)

@@ -31,6 +31,7 @@ def chain_of(args: argparse.Namespace, model: Any = None, loop: bool = False) ->
     machine = options.machine_of(args, model)
     if not loop:
         machine.plant.of_one_actuator("judging subsystems")
+        machine.calibration.of_one_channel("judging subsystems")
     own_parts = split([x for group in getattr(args, "fit", ()) for x in group], options.parts_to_test(args))[:2]
     log = options.read_log_of(args, require=())
     if loop:

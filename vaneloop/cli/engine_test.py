@@ -55,6 +55,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--hysteresis", type=float, metavar="DEG", help="total width at the VIGV (default: the geometry's 1.6 deg)"
     )
     options.add_tables_option(parser)
+    options.add_channels_option(parser)
     options.add_controller_options(parser)
     parser.add_argument(
         "--geometry",

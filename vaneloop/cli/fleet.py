@@ -152,7 +152,9 @@ def _job(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
 def _known_machine(args: argparse.Namespace) -> None:
     """Refuse a machine or a system that cannot be read, before anything is begun."""
     if not args.system:
-        options.machine_of(args).plant.of_one_actuator("a fleet's logs")
+        machine = options.machine_of(args)
+        machine.plant.of_one_actuator("a fleet's logs")
+        machine.calibration.of_one_channel("a fleet's logs")
         return
     for name in ("tables", "plant", "controller"):
         if getattr(args, name):

@@ -26,6 +26,7 @@ examples:
   vaneloop inject demand_stops               one of them
   vaneloop inject --all --junit inject.xml   all of them, for continuous integration
   vaneloop inject MY_DAY.toml                your own (docs/injection.md)
+  vaneloop inject --all --channels 2 --plant plant_two_actuators.toml   those of two channels (docs/channels.md)
   vaneloop inject --all --controller FW.so --junit fw.xml   a controller of your own (docs/own_controller.md)
   vaneloop inject flood_low_priority --bus vcan0   against vaneloop run and vaneloop ecu, in real time
 
@@ -46,6 +47,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bus", default="lockstep", metavar="BUS", help="lockstep (default), local, vcan0, ...")
     parser.add_argument("--seed", type=int, metavar="N", help="instead of the scenario's own")
     options.add_machine_options(parser)
+    options.add_channels_option(parser)
     options.add_controller_options(parser)
     parser.add_argument(
         "--reactions",
@@ -59,7 +61,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def command(args: argparse.Namespace) -> int:
     """Run what ``args`` ask for; return the exit code."""
-    known = library()
+    known = library(args.channels or 1)
     if args.list:
         return _list(args, known)
     if bool(args.scenario) == args.all:
@@ -70,7 +72,9 @@ def command(args: argparse.Namespace) -> int:
     made = [(Path(n).stem, load_scenario(n)) for n in named]
     if args.seed is not None:
         made = [(n, s.model_copy(update={"seed": args.seed})) for n, s in made]
-    if args.bus != "lockstep" and (given := [f"--{n}" for n in ("model", "tables", "plant") if vars(args)[n]]):
+    if args.bus != "lockstep" and (
+        given := [f"--{n}" for n in ("model", "tables", "plant", "channels") if vars(args)[n]]
+    ):
         raise InputError(
             f"{given[0]} is for --bus lockstep; on {args.bus} the machine is vaneloop run's: give it there"
         )
@@ -87,7 +91,7 @@ def command(args: argparse.Namespace) -> int:
     outcomes, skipped = [], []
     with terminal.progress_bar(args, "injecting") as progress:
         for i, (name, scenario) in enumerate(made):
-            why = cannot(scenario) if args.bus != "lockstep" else lacks(scenario, machine.plant)
+            why = cannot(scenario) if args.bus != "lockstep" else lacks(scenario, machine.plant, machine.calibration)
             if why and len(made) > 1:
                 skipped.append((name, scenario.title, why))
                 continue

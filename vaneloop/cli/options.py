@@ -21,8 +21,8 @@ from vaneloop.base.errors import InputError
 from vaneloop.verbs.machine import TABLES, Machine, files_of
 
 __all__ = [
-    "A_LOG", "add_controller_options", "add_log_options", "add_machine_options", "add_plant_option",
-    "add_reading_options", "add_tables_option", "add_trust_option", "add_without_option", "answered", "guarded",
+    "A_LOG", "add_channels_option", "add_controller_options", "add_log_options", "add_machine_options",
+    "add_plant_option", "add_reading_options", "add_tables_option", "add_trust_option", "add_without_option", "answered", "guarded",
     "log_options", "machine_of", "parts_to_test", "read_log_of", "say_located", "say_tested", "search_bar",
     "tables_of", "trusted", "warm_up_for",
 ]  # fmt: skip
@@ -157,6 +157,18 @@ def add_plant_option(group: Any) -> None:
     )
 
 
+def add_channels_option(group: Any) -> None:
+    """Declare ``--channels``."""
+    group.add_argument(
+        "--channels",
+        metavar="N",
+        type=int,
+        choices=(1, 2),
+        help="channels of the controller, 1 or 2, in place of what calibration.toml has; two need a machine with two "
+        "actuators (docs/channels.md)",
+    )
+
+
 def add_controller_options(parser: Any, save_crash: bool = True) -> None:
     """Declare ``--controller`` and ``--save-crash``; the command's function must be `guarded`."""
     group = parser.add_argument_group("a controller of your own (docs/own_controller.md)")
@@ -222,6 +234,7 @@ def machine_of(args: argparse.Namespace, model: Any = None, strategy: str | None
         strategy,
         getattr(args, "plant", None),
         getattr(args, "controller", None),
+        getattr(args, "channels", None),
     )
 
 

@@ -48,6 +48,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="single (one mean curve), dual (one a direction), inverse or adaptive (docs/strategies.md)",
     )
     options.add_machine_options(group)
+    options.add_channels_option(group)
     options.add_controller_options(parser)
     group.add_argument(
         "--tolerance",

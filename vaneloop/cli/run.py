@@ -79,6 +79,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", metavar="N", type=int, help="noisy sensors, with this seed (default: noise-free)")
     options.add_machine_options(parser)
+    options.add_channels_option(parser)
     parser.add_argument(
         "--plant-map",
         metavar="NAME=signal",
@@ -145,6 +146,7 @@ def command(args: argparse.Namespace) -> int:
         raise InputError("--inputs, --profile and --log exclude each other")
     options.log_options(args, args.profile)
     if not lockstep:
+        options.machine_of(args).calibration.of_one_channel("a bus in real time")
         return _in_real_time(args, name)
     return _repeat(args) if args.inputs else _in_lockstep(args)
 

@@ -63,7 +63,8 @@ def _of_system(path: str, files: dict[str, str], reading: dict[str, Any]) -> tup
 
 def _machine(files: dict[str, str]) -> Machine:
     given = {"tables": "tables", "model": "model", "table": "plant", "controller": "controller"}
-    return Machine(**{argument: files[name] for argument, name in given.items() if name in files})
+    named: dict[str, Any] = {argument: files[name] for argument, name in given.items() if name in files}
+    return Machine(**named)
 
 
 def _nominal(said: Diagnosed) -> list[dict[str, Any]]:

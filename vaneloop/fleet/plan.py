@@ -173,7 +173,8 @@ def load_plan(file: str | Path) -> Plan:
     def placed(c: Choice) -> Choice:
         return c.model_copy(update={"tables": at(c.tables), "controller": at(c.controller)})
 
-    scenarios = [s if s in library() and not (folder / s).is_file() else str(at(s)) for s in plan.scenarios]
+    known = library() | library(2)
+    scenarios = [s if s in known and not (folder / s).is_file() else str(at(s)) for s in plan.scenarios]
     for s in scenarios:
         made = load_scenario(s)
         if any(isinstance(a, Replay) and a.log for a in made.inject):
@@ -195,7 +196,7 @@ def groups(plan: Plan) -> Iterator[Group]:
 
 def files_of_plan(plan: Plan) -> dict[str, str]:
     """Files that trials need, by the names under which a run keeps copies."""
-    known = library()
+    known = library() | library(2)
     files = {f"scenario.{Path(s).stem}": str(known.get(s, s)) for s in plan.scenarios}
     files |= {f"tables.{c.name}": c.tables for c in plan.calibration if c.tables}
     files |= {f"firmware.{c.name}": c.controller for c in plan.firmware if c.controller}

@@ -70,7 +70,7 @@ def _prepared(files: tuple[tuple[str, str], ...], g: Group) -> _Prepared | Alone
     plant, calibration, scenario = machine.plant, machine.calibration, scenario_of(named, g)
     if machine.controller is not None:
         return Alone("a controller of the user's own")
-    if why := lacks(scenario, plant):
+    if why := lacks(scenario, plant, calibration):
         raise InputError(f"{g.scenario}: {why}")
     check_stages(g.scenario, scenario, plant)
     if not can(scenario, plant, calibration):

@@ -57,6 +57,7 @@ class Machine:
     strategy  control strategy, one of `controller.STRATEGIES`; None: the calibration's
     table     plant table in place of that of ``tables``, such as plant_electromechanical.toml
     controller  shared library of the user's own in place of the firmware here (docs/own_controller.md)
+    channels  1 or 2 of the controller, in place of what its table has (docs/channels.md)
 
     A wrong folder, table or model raises InputError when the machine is made.
     """
@@ -66,6 +67,7 @@ class Machine:
     strategy: str | None = None
     table: str | Path | None = None
     controller: str | Path | None = None
+    channels: int | None = None
 
     def __post_init__(self) -> None:
         """Read what is named, so that a wrong name, or tables of different stages, are refused here."""
@@ -93,9 +95,10 @@ class Machine:
     def calibration(self) -> Calibration:
         """What the controller is flashed with."""
         f = self.files
-        made = load_calibration(f["calibration"], f["stroke_tables"], self.strategy, f["vane_angles"])
+        made = load_calibration(f["calibration"], f["stroke_tables"], self.strategy, f["vane_angles"], self.channels)
         if self.controller is None:
             return made
+        made.of_one_channel("a controller of your own")
         own = Path(self.tables or "") / OWN
         return made._replace(program=Program(str(self.controller), str(own) if self.tables and own.is_file() else None))
 

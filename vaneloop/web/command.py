@@ -70,7 +70,9 @@ def command(args: argparse.Namespace) -> int:
     folder = Path(args.folder)
     if not folder.is_dir():
         raise InputError(f"--folder {args.folder}: is not a folder")
-    machine_of(args).plant.of_one_actuator("the workbench")  # refuses wrong tables, too
+    machine = machine_of(args)  # refuses wrong tables, too
+    machine.plant.of_one_actuator("the workbench")
+    machine.calibration.of_one_channel("the workbench")
     token = os.environ.get("VANELOOP_WEB_TOKEN") or secrets.token_urlsafe(24)
     if len(token) < LEAST_TOKEN or not token.isascii() or not all(c.isalnum() or c in "-_" for c in token):
         raise InputError(

@@ -213,6 +213,8 @@ def _build(
         raise LogError(
             f"{log.path}: actuators.number (={machine.sides}) must be 1 for judging subsystems (docs/machines.md)"
         )
+    if tables.channels is not None:
+        raise LogError(f"{log.path}: channels.number (=2) must be 1 for judging subsystems (docs/channels.md)")
     grid = grid or grid_of(log)
     absent: dict[str, str] = {}
     # subsystems that have the same rows, and the same channels late
