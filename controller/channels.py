@@ -9,8 +9,8 @@ Each channel runs the firmware (`controller.firmware`) on the LVDT of its own ac
 
 **Selection.** Both good and within ``disagree_limit``: their mean. Farther apart for ``confirm_time``: the one that is
 nearer to the model; until then the model itself stands in. One alone is good: that one at once. None: none, and the
-firmware's LVDT monitors act. The way back to the mean asks for ``disagree_limit`` less ``hysteresis`` over the same
-time; from one of two that disagree to the other it must be nearer by ``hysteresis``. A change fades in at
+firmware has the faults of the channel's LVDT. The way back to the mean asks for ``disagree_limit`` less ``hysteresis``
+over the same time; from one of two that disagree to the other it must be nearer by ``hysteresis``. A change fades in at
 ``fade_rate``, so that the piston is not moved by a step.
 
 **Model.** First-order rate of the stroke under the sent current, held to the selected stroke x_s by a critically damped
@@ -47,6 +47,7 @@ from controller.records import (
     DEGRADED,
     FAIL_SAFE,
     FAULT_FIELDS,
+    FAULTS,
     HALF_TICK,
     INIT,
     LVDT_MASK,
@@ -64,7 +65,7 @@ from vaneloop.base.compiled import in_place
 __all__ = [
     "CATCH_UP", "CHANNELS", "CHANNEL_FIELDS", "HEALTHS", "KEPT", "LATCH_FIELDS", "LINE_FIELDS", "LINK", "NEVER",
     "PAIR_FIELDS", "PAIR_SCALARS", "SEEN", "SOURCES", "as_channel", "as_latch", "as_line", "as_pair", "change_over",
-    "health_of", "judge_coil", "linked", "listen", "new_channel", "select", "share_of", "speak", "track",
+    "health_of", "judge_coil", "linked", "listen", "new_channel", "pass_on", "select", "share_of", "speak", "track",
 ]  # fmt: skip
 
 CHANNELS = ("A", "B")
@@ -272,6 +273,24 @@ def select(w: Record, c: Record, k: Record, x: float, i: float, pause: float) ->
         w.v_drift += off * TICK / (c.model_time * c.model_time)
     w.x_select = chosen + w.fade
     return w.x_select
+
+
+@in_place
+def pass_on(w: Record, z: Record, was: int) -> None:
+    """Give the firmware the faults of the channel's LVDT while no stroke is left; take them back with the first good
+    one.
+
+    z    the firmware's state, before its tick
+    was  the source of the tick before
+    """
+    none, own, faults = int(w.source) == NONE, int(w.faults) & LVDT_MASK, int(z.faults)
+    if none:
+        z.faults = float(faults | own)
+    elif was == NONE:
+        z.faults = float(faults & ~LVDT_MASK)
+    for bit in range(len(FAULTS)):
+        if LVDT_MASK & (1 << bit) and (own & (1 << bit) if none else was == NONE):
+            z.timers[bit] = 0.0
 
 
 # ---- health, change-over, drive --------------------------------------------------------------------------------------

@@ -153,6 +153,8 @@ NEEDED: dict[str, dict[str, Any]] = {
     "send": {"frame": 0x10, "data": "00"},
     "replay": {"log": "a.log"},
     "machine": {"p_s": 1.0},
+    "channel": {"channel": "A", "fault": "off"},
+    "link": {"loss": 1.0},
 }
 DEFAULTS: dict[str, dict[str, Any]] = {
     "drop": FRAME,
@@ -171,7 +173,9 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "replay": {**ALWAYS, "begin": None, "length": 1.0, "frame": None, "loop": True},
     "error_frames": {**ALWAYS, "probability": 1.0},
     "bus_off": {**ALWAYS, "node": "ECU"},
-    "machine": {**ALWAYS, "t_oil": None, "effect": None, "parameters": {}},
+    "machine": {**ALWAYS, "t_oil": None, "effect": None, "parameters": {}, "side": None},
+    "channel": ALWAYS,
+    "link": {**ALWAYS, "delay": 0.0, "sender": "both"},
 }  # fmt: skip
 
 
@@ -715,7 +719,7 @@ def test_a_scenario_is_an_ecu_at_80_percent_by_default() -> None:
     made = Scenario(title="four", duration=1.0)
     assert made.model_dump() == {
         "title": "four", "why": "", "duration": 1.0, "seed": 1, "demand": [[0.0, 80.0]], "secoc": False, "inject": [],
-        "expect": [],
+        "expect": [], **dict.fromkeys(("side_a", "side_b"), {"parameters": {}, "effects": {}}),
     }  # fmt: skip
 
 

@@ -37,6 +37,7 @@ from controller.channels import (
     linked,
     listen,
     new_channel,
+    pass_on,
     select,
     share_of,
     speak,
@@ -204,7 +205,9 @@ def control_pair(
         fed = as_inputs(q.inputs[c])
         listen(w, q.link[1 - c], as_line(q.line[1 - c]), k)
         i = w.other_i if c != on and linked(w, of) else state.i_cmd
+        was = int(w.source)
         fed.x_lvdt = select(w, of, scalars, np.nan if q.lvdt[c] == LOST else x, i, fed.pause)
+        pass_on(w, state, was)
         tick(q.inputs[c], q.z[c], cal)
         _catch_up(q, c, c == on)
         track(w, state, of, scalars, c == on)

@@ -26,7 +26,7 @@ examples:
   vaneloop inject demand_stops               one of them
   vaneloop inject --all --junit inject.xml   all of them, for continuous integration
   vaneloop inject MY_DAY.toml                your own (docs/injection.md)
-  vaneloop inject --all --channels 2 --plant plant_two_actuators.toml   those of two channels (docs/channels.md)
+  vaneloop inject --all --channels 2 --plant tables/plant_two_actuators.toml   those of two channels (docs/channels.md)
   vaneloop inject --all --controller FW.so --junit fw.xml   a controller of your own (docs/own_controller.md)
   vaneloop inject flood_low_priority --bus vcan0   against vaneloop run and vaneloop ecu, in real time
 
