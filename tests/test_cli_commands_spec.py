@@ -1535,7 +1535,7 @@ def test_a_scenario_that_cannot_be_is_left_out_among_others(ran: Ran, monkeypatc
     from vaneloop.cli import inject
 
     asked: list[str] = []
-    monkeypatch.setattr(inject, "lacks", lambda scenario, plant: "no such part")
+    monkeypatch.setattr(inject, "lacks", lambda scenario, *machine: "no such part")
 
     def run(scenario: Any, name: str, **more: Any) -> Any:
         asked.append(name)
@@ -1580,9 +1580,9 @@ def test_what_names_a_machine_and_a_log_reaches_them(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(options, "Machine", lambda *given: given)
     args = argparse.Namespace(tables="T", model="m.toml", plant="p", controller="c.so")
-    assert options.machine_of(args, strategy="dual") == ("T", "m.toml", "dual", "p", "c.so")
-    assert options.machine_of(args, "other") == ("T", "other", None, "p", "c.so")
-    assert options.machine_of(argparse.Namespace(model="")) == (None, None, None, None, None)
+    assert options.machine_of(args, strategy="dual") == ("T", "m.toml", "dual", "p", "c.so", None)
+    assert options.machine_of(args, "other") == ("T", "other", None, "p", "c.so", None)
+    assert options.machine_of(argparse.Namespace(model="")) == (None, None, None, None, None, None)
     order: list[Any] = []
     monkeypatch.setattr(options, "log_options", lambda args: {"part": 3})
     monkeypatch.setattr(options, "warm_up_for", order.append)

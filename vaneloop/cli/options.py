@@ -22,9 +22,9 @@ from vaneloop.verbs.machine import TABLES, Machine, files_of
 
 __all__ = [
     "A_LOG", "add_channels_option", "add_controller_options", "add_log_options", "add_machine_options",
-    "add_plant_option", "add_reading_options", "add_tables_option", "add_trust_option", "add_without_option", "answered", "guarded",
-    "log_options", "machine_of", "parts_to_test", "read_log_of", "say_located", "say_tested", "search_bar",
-    "tables_of", "trusted", "warm_up_for",
+    "add_plant_option", "add_reading_options", "add_tables_option", "add_trust_option", "add_without_option",
+    "answered", "guarded", "log_options", "machine_of", "parts_to_test", "read_log_of", "say_located", "say_tested",
+    "search_bar", "tables_of", "trusted", "warm_up_for",
 ]  # fmt: skip
 
 A_LOG = f"{listed(OURS)}, or the format of a package (docs/logs.md)"
