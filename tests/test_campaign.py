@@ -86,14 +86,14 @@ during = [0.3, 0.35]
 """
 
 
-def write(folder: Path, margin: float = 0.05, more: str = "", keys: str = "") -> Path:
+def write(folder: Path, margin: float = 0.05, more: str = "", keys: str = "", name: str = "still") -> Path:
     """A plan whose scenario holds while the potentiometer's bias is below ``margin`` deg; the rest is idle."""
     still = inject.Scenario(title="still", duration=0.4)
     vigv = inject.run(still).trace.signals["vigv"][300:351].max()
-    (folder / "still.toml").write_text(STILL.format(high=float(vigv) + margin))
+    (folder / f"{name}.toml").write_text(STILL.format(high=float(vigv) + margin))
     plan = folder / "plan.toml"
     plan.write_text(
-        f'title = "bias"\nscenarios = ["still.toml"]\nsamples = 16\nsearch = 16\nsensitivity = 8\n{keys}\n'
+        f'title = "bias"\nscenarios = ["{name}.toml"]\nsamples = 16\nsearch = 16\nsensitivity = 8\n{keys}\n'
         f'[vary]\n"sensors.vigv_bias" = "tolerance"\n"engine.lag" = [1.1, 1.3]\n{more}'
     )
     return plan
@@ -180,6 +180,21 @@ def test_a_controller_that_crashes_is_a_failed_machine_and_not_the_end(tmp_path:
     assert (ours.failed, theirs.failed) == (0, 4) and view.passed(ours) and not view.passed(theirs)
     assert theirs.same and "--controller" in theirs.command and "abort" in theirs.seen[0]
     assert len(theirs.failures) == 4 and theirs.reproduces and "--controller" in theirs.failures[0].command
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["model", "plant", "command"])
+def test_a_scenario_may_be_called_as_a_file_that_is_saved_beside_it(name: str, tmp_path: Path) -> None:
+    plan = write(tmp_path, keys="saved = 1", name=name)
+    text = plan.read_text().replace("samples = 16\nsearch = 16\nsensitivity = 8", "samples = 8\nsearch = 0")
+    shutil.copy(ROOT / "tables" / "plant.toml", tmp_path / "machine.toml")
+    plan.write_text(f'plant = "machine.toml"\n{text}')
+    read, quantities, folder = campaign.begin(plan, tmp_path / "run", 3600.0)
+    assert campaign.take_samples(read, quantities, folder) == 8
+    work(folder.path)
+    (g,) = campaign.judge(read, quantities, folder, lambda fraction: None).groups
+    assert g.name == f"{name}.shipped.shipped" and g.failed > 0
+    assert g.same and all(f.same for f in g.failures) and g.failures
 
 
 @pytest.mark.slow

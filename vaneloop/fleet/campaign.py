@@ -280,7 +280,8 @@ def _copied(
     """What the machines of a group have in common, copied into a folder of the run: contents of the files, and the
     copies by the names that `Plan` gives them.
     """
-    scenario = at / f"{g.scenario}.toml"
+    # its name is the user's, who may call it as one of the other files
+    scenario = folder.room(*at.relative_to(folder.path).parts, "scenario") / f"{g.scenario}.toml"
     contents: dict[Path, str | bytes] = {scenario: Path(files[f"scenario.{g.scenario}"]).read_bytes()}
     own = {f"scenario.{g.scenario}": str(scenario)}
     for option, key in _options(g):
