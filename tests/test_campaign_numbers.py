@@ -871,12 +871,17 @@ def test_a_campaign_says_how_many_fail_and_which_is_worst(
     assert len(g.first) == len(g.total) == 2
     assert (view.title, view.run, view.version) == ("Made", str(run.path), run.job["version"])
     at = run.path / "worst" / "still.shipped.shipped"
-    assert sorted(f.name for f in at.iterdir()) == ["command.txt", "model.toml", "still.toml"]
-    words = ["vaneloop", "inject", str(at / "still.toml"), "--model", str(at / "model.toml")]
+    assert sorted(f.name for f in at.iterdir()) == ["command.txt", "model.toml", "scenario"]
+    words = ["vaneloop", "inject", str(at / "scenario" / "still.toml"), "--model", str(at / "model.toml")]
     assert (
         g.command == shlex.join(words) and (at / "command.txt").read_text() == g.command + "\n" and g.saved == str(at)
     )
-    assert again[0] == ({"scenario.still": str(at / "still.toml"), "model": str(at / "model.toml")}, g.name, [], [])
+    assert again[0] == (
+        {"scenario.still": str(at / "scenario" / "still.toml"), "model": str(at / "model.toml")},
+        g.name,
+        [],
+        [],
+    )
     assert len(again) == 1 + failed and [f.least for f in g.failures] == sorted(s for s in shares if s < 0.0)
     assert g.reproduces and g.saved_failures() == f"{failed} of {failed} failed machines saved, the worst first"
     model = (at / "model.toml").read_text()
@@ -924,7 +929,7 @@ def test_failed_machines_are_saved_the_worst_first_and_run_again_to_the_same(
     )
     for f, x in zip(g.failures, order[:3], strict=True):
         assert np.array_equal(point_of(f.file, a), x) and f.least == fails(x) and np.array_equal(a[int(f.name)], x)
-        assert shlex.split(f.command) == ["vaneloop", "inject", str(at / "still.toml"), "--model", f.file]
+        assert shlex.split(f.command) == ["vaneloop", "inject", str(at / "scenario" / "still.toml"), "--model", f.file]
         assert f.same == (same if alone == "" else off == 0.0)
     assert g.reproduces == (g.same and g.failures[0].same) and (g.reproduces or not view.passed(g))
     left = g.failed - 3
@@ -988,7 +993,7 @@ def test_a_worst_machine_that_cannot_be_saved_whole_leaves_the_earlier_one(
         return {str(f.relative_to(at)): f.read_bytes() for f in at.rglob("*") if f.is_file()}
 
     before = there()
-    assert set(before) == {"command.txt", "model.toml", "still.toml", "tables/plant.toml"}
+    assert set(before) == {"command.txt", "model.toml", "scenario/still.toml", "tables/plant.toml"}
     (at / "command.txt").unlink()
     (at / "command.txt").mkdir()
     with pytest.raises(InputError, match=r"command\.txt"):
@@ -1020,7 +1025,7 @@ def test_the_worst_machine_is_saved_with_all_that_it_is_made_of(
     assert at == run.path / "worst" / "still.soft.mine" and same and not stale.exists()
     assert (at / "tables" / "plant.toml").read_text() == "T/plant.toml"
     assert (at / "plant.toml").read_text() == "p.toml" and (at / "controller.so").read_text() == "c.so"
-    assert (at / "still.toml").read_text() == SCENARIO
+    assert (at / "scenario" / "still.toml").read_text() == SCENARIO
     words = [
         "--tables",
         str(at / "tables"),
@@ -1030,5 +1035,5 @@ def test_the_worst_machine_is_saved_with_all_that_it_is_made_of(
         str(at / "controller.so"),
     ]
     assert shlex.split(command)[5:] == words
-    assert asked == [{"scenario.still": str(at / "still.toml"), "model": str(at / "model.toml"),
+    assert asked == [{"scenario.still": str(at / "scenario" / "still.toml"), "model": str(at / "model.toml"),
                       "tables.soft": words[1], "plant": words[3], "firmware.mine": words[5]}]  # fmt: skip
