@@ -153,7 +153,7 @@ NEAREST = {
         "starts your_own_model kept held",
     ),
     "vaneloop.identification.vane_chain": (
-        "vane_chain_spec recorders stationary_noise late_channels same_answer learn_vanes learn_lags learn_stops "
+        "vane_chain_spec recorders hum stationary_noise late_channels same_answer learn_vanes learn_lags learn_stops "
         "learn_followers learn_faint learn_screening held loggers long_logs identification curves directions "
         "electromechanical readings"
     ),

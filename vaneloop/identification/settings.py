@@ -1533,6 +1533,13 @@ NOISE_DRAWS = setting(
     "So many tell how much of the noise behind a low-pass a noise floor shows, and what noise does to a subsystem.",
     "budget of work: the draws differ by some per cent",
 )
+HUM_CHANCE = setting(
+    1e-6, "probability", "Of a log without hum one of so many has a line taken out.", "principle: never by chance"
+)
+HUM_NEARBY = setting(
+    201, "bins", "A line stands out of the median of so many bins.", "judgement: the noise is even over so many"
+)
+HUM_LINES = setting(4, "lines", "At most so many lines of hum are taken out.", "budget of work: the mains, harmonics")
 MOVES_ALIKE = setting(
     0.1,
     "share",

@@ -71,6 +71,7 @@ from vaneloop.identification.vane_chain.current import (
 )
 from vaneloop.identification.vane_chain.demand import demand_stage, own_demand_stage
 from vaneloop.identification.vane_chain.engine import engine_stage
+from vaneloop.identification.vane_chain.hum import without_hum
 from vaneloop.identification.vane_chain.linkage import linkage_stage
 from vaneloop.identification.vane_chain.resample import (
     OF_SUBSYSTEM,
@@ -156,6 +157,7 @@ def build_chain(
     draws    of what the log hides from the servo
     late     what stands late in the log, where that is known; None: it is to be found
     """
+    log = without_hum(log)
     known = late or {}
     framed = any(c.framed for c in log.channels.values())  # frames are stamped by one clock
     chain = _build(log, plant, calibration, present, grid, pieces, draws, known)
