@@ -1079,6 +1079,7 @@ def test_the_demand_of_the_machine_s_own_firmware_is_the_logged_one(chain: Chain
     columns = driven.columns | {name: driven.columns[name][n] for name in ("n_dem", "n_r")}
     same = demand_stage(driven._replace(columns=columns, again=True))
     assert held[inner] == pytest.approx(same.run(same.neutral()[None])[0, 0, inner])
+    assert np.array_equal(with_("frame_hold", 0.0004, 0.4), as_is)  # a frame comes every 10 ms
     assert not np.array_equal(with_("trend_threshold_error", 5.0), as_is)
     assert same.lost is None and stage.lost is not None and len(stage.lost) == 8
     phase = stage.effect("frame_hold").parameters[1]

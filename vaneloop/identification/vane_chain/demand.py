@@ -46,7 +46,7 @@ def _demand_run(
     skipped = round(t[first] / dt) - first  # rows of the log's raster before this one that are not here
     for i in range(first, last):
         at = t[i]
-        if hold > 0.0:
+        if hold > dt:  # within a period of the frames there is nothing to hold
             at = np.floor((at - phase) / hold + 1e-9) * hold + phase
         at = (at - delay) / dt - skipped
         j = min(max(int(np.floor(at + 1e-9)), first), last - 1)
