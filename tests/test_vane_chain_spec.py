@@ -351,7 +351,7 @@ def test_a_current_that_is_not_the_mean_of_its_ticks_is_made_that(what: str, sam
 def test_the_current_of_every_tick_has_the_logged_mean() -> None:
     law = np.cumsum(white(5, 300, 10).ravel()).reshape(300, 10) * 0.1
     limit = 0.9e3 * CALIBRATION.scalars.current_limit
-    c = {"i_cmd": law.mean(axis=1) + 4.0, "missing": np.zeros(300)}
+    c = {"i_cmd": law.mean(axis=1) + 4.0, "missing": np.zeros(300), "fresh": np.ones(300)}
     c["i_cmd"][200] = 1.01 * limit
     run = np.arange(300) >= 20
     ticks = between_rows(c, law, 0.3, run, CALIBRATION, None, 0)

@@ -65,7 +65,7 @@ def servo_law(
     how much their mean, and that of the ticks that `samples_of` gives for ``samples``, are off because not all of
     stroke and demand is logged, each float64[rows, draws].
     """
-    x_dem, x = c["x_dem"], np.where(c["missing"] == 0.0, c["x_lvdt"], smooth.stroke)
+    x_dem, x = c["x_dem"], np.where(_known(c), c["x_lvdt"], smooth.stroke)
     gains = (cal.scalars.kp, cal.scalars.ki, cal.scalars.kff)  # A/m = mA/mm
     when = np.maximum(t[:, None] - RASTER + chain.TICK * np.arange(1, 11)[None], t[0])
     stroke = np.empty(when.shape)
@@ -167,7 +167,7 @@ def between_rows(
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal(law.shape)
     noise[:, -1] = 0.0
-    known = c["missing"] == 0.0
+    known = _known(c)
     slow = scipy.ndimage.uniform_filter1d(  # the integral's constant
         _bridged(c["i_cmd"] - law.mean(axis=1), known), SMOOTH_ROWS[-1]
     )
@@ -292,8 +292,8 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = 
     whole = scipy.ndimage.uniform_filter1d(c["fresh"], 5) > 0.999  # rows with their neighbours
     calibrated = _calibrated(step, dt, logged, whole)
     model = np.cumsum(np.where(whole, calibrated, logged))  # over a gap the model goes where the stroke went
-    sampled = ~whole | (c["missing"] == 0.0)
-    off = _bridged(c["x_lvdt"] - model, sampled)
+    known_rows = _known(c)
+    off = _bridged(c["x_lvdt"] - model, known_rows)
     tried = []
     for rows in SMOOTH_ROWS:
         smooth, own = _smoothed(off, rows), _weights(rows)[rows // 2]
@@ -303,7 +303,7 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = 
     noise = min(noise_floor(t, np.where(whole, off, np.nan)), size)
     half = rows // 4 * 2 + 1
     differs = smooth - _smoothed(off, half)
-    fast = sampled & (np.abs(differs) > 2.0 * noise)  # rather noisy than wrong
+    fast = known_rows & (np.abs(differs) > 2.0 * noise)  # rather noisy than wrong
     wide, narrow, as_is = _weights(rows), np.zeros(rows), np.zeros(rows)
     narrow[(rows - half) // 2 : (rows + half) // 2] = _weights(half)
     as_is[rows // 2] = 1.0
@@ -323,6 +323,11 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = 
     uneven = np.sqrt(share * jerky)
     stroke, distortion = np.where(fast, c["x_lvdt"], model + smooth), np.where(fast, off - smooth, distortion)
     return Smooth(stroke, noise, rows, distortion, uneven, off)
+
+
+def _known(c: Mapping[str, Array]) -> Array:
+    """Rows but those between two gaps that miss a sample: what is in a gap counts nowhere."""
+    return np.asarray((c["missing"] == 0.0) | (c["fresh"] == 0.0))
 
 
 def _bridged(values: Array, known: Array) -> Array:
