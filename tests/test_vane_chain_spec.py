@@ -1132,10 +1132,11 @@ def test_noise_of_an_input_counts_as_an_error_as_far_as_it_is_seen() -> None:
     t, grid = 0.01 * np.arange(6000), 0.5
     values = np.round(40.0 * np.sin(0.02 * t) / grid) * grid
     for seed in range(3):  # a digit: even over one step, and the same as long as the value is
-        draw = _other_noise(t, values, seed)
+        draw = _other_noise(t, values)(np.random.default_rng(seed))
         assert np.abs(draw).max() <= 0.5 * grid and np.ptp(draw) > 0.9 * grid
         assert not np.diff(draw)[np.diff(values) == 0.0].any()
-    one, two = (_other_noise(t, np.sin(t) + 0.2 * white(3, 6000), seed) for seed in (0, 1))
+    of = _other_noise(t, np.sin(t) + 0.2 * white(3, 6000))
+    one, two = (of(np.random.default_rng(seed)) for seed in (0, 1))
     assert one.std() == pytest.approx(0.2, rel=0.05) and abs(np.corrcoef(one, two)[0, 1]) < 0.05
     makes = np.array([white(k, 6000) for k in (1, 2, 3)])
     share, beyond = _by_noise(t, 0.5 * white(4, 6000), makes, 1e-3)

@@ -1,8 +1,8 @@
 """Rows that a logger wrote again because nothing new had come: every channel repeats the row before, to the last bit.
 
-A channel with noise in its last digit turns back in every second row, and repeats itself by chance now and then; where
-the machine rests more often, so that the rows around tell. The noise of two channels is independent: the chance that
-all repeat is the product of theirs. Without noise a machine at rest looks the same, and nothing is stale.
+A channel with noise in its last digit turns back in every second row. By chance it repeats itself now and then, more
+often where the machine rests: the rows around tell how often. The noise of two channels is independent, so that the
+chance that all repeat is the product of theirs. Without noise a machine at rest looks the same, and nothing is stale.
 """
 
 from __future__ import annotations

@@ -151,6 +151,22 @@ class LeastSquaresProblem:
         """Number of the block that each sample is in, int64[samples]."""
         return np.repeat(np.arange(self.n_blocks), np.diff(self.block_start, append=len(self.stage.t)))
 
+    @property
+    def nominal(self) -> list[int]:
+        """Columns of the nominal parameters that are not exactly known."""
+        return [i for i, p in enumerate(self.stage.parameters) if p.tolerance > 0.0]
+
+    def nominal_slopes(self, theta: Array) -> tuple[Array, Array]:
+        """Errors at ``theta``, float64[outputs, samples], and their slopes by each of the `nominal` parameters,
+        float64[parameters, outputs, samples]: over a twentieth of its tolerance.
+        """
+        free = self.nominal
+        sizes = np.array([0.05 * self.stage.parameters[i].tolerance for i in free])
+        tries = np.repeat(theta[None], len(free) + 1, axis=0)
+        tries[np.arange(1, len(free) + 1), free] += sizes
+        e = self.errors(tries)
+        return e[0], (e[1:] - e[0]) / sizes[:, None, None]
+
     def errors(self, thetas: Array) -> Array:
         """Whitened errors float64[sets, outputs, samples], measured minus model; 0 where nothing was measured."""
         return self._latest.errors(np.atleast_2d(thetas), self._simulated)

@@ -59,11 +59,11 @@ def actuator_stage(driven: Driven) -> Stage:
     stage.alike = {"valve_flow_saturation": _quadratic_drag}
     window = int(round(WINDOW / dt))
 
-    columns = stage.index()
+    columns, other = stage.index(), step_currents(others, dt, substeps)
 
     def hidden(theta: Array) -> Array:
         out = simulate(theta[None])[0]
-        between = rms(stage, out - simulate(theta[None], step_currents(others, dt, substeps))[0])
+        between = rms(stage, out - simulate(theta[None], other)[0])
         if "piston_stiction" not in columns or theta[columns["piston_stiction"].start] == 0.0:
             return between
         excess, speed = theta[columns["piston_stiction"]] * (1.0, 1e-3)
@@ -82,10 +82,11 @@ def actuator_stage(driven: Driven) -> Stage:
     if others is not i:
         stage.hidden = hidden
         if not driven.again:
-            stage.raster_error = np.hypot(stage.raster_error, hidden(stage.neutral()))
-            if c["missing"].any():  # and where samples of the current are missing, most of it
-                neutral = stage.neutral()[None]
-                stage.lost = simulate(neutral) - simulate(neutral, step_currents(others, dt, substeps))
+            neutral = stage.neutral()[None]
+            lost = simulate(neutral) - simulate(neutral, other)
+            stage.raster_error = np.hypot(stage.raster_error, rms(stage, lost[0]))
+            if c["missing"].any():  # most of it is where samples of the current are missing
+                stage.lost = lost
 
     def kept(at: Array) -> Array:
         keep = run[at]

@@ -188,8 +188,9 @@ def _shifted(t: Array, values: Array, late: float | Array) -> Array:
 def _servo(stage: Stage) -> list[Late]:
     """Stroke demand and stroke against the current, by the firmware's law, which is linear in both.
 
-    The current is the mean of the ticks since the row before or that of the last; the noise that it shares with the
-    stroke at the row tells which, where the stroke need not move.
+    The current is the mean of the ticks since the row before or that of the last. What it has in common with a row's
+    noise is projected out, and what the demand's rounding makes is taken off the squares: both would favour what
+    smooths most.
     """
     if _fits(stage):
         return []
@@ -213,7 +214,7 @@ def _servo(stage: Stage) -> list[Late]:
     shared /= max(float(np.linalg.norm(shared)), 1e-300)
 
     # and what the demand's last digit hides the controller knew
-    hidden = last_digit(c["x_dem"], np.random.default_rng(0))
+    hidden = last_digit(c["x_dem"])(np.random.default_rng(0))
 
     def demanded(passed: LowPass, x_dem: Array) -> Both:
         return both(law_of(x_dem, none, cal, behind=passed))
@@ -305,26 +306,23 @@ def _fit(
     floor = np.asarray(stage.floor)
     judge = LeastSquaresProblem(stage, floor)
     theta, late = recalibrate(judge).theta, np.zeros(terms) if start is None else start
-    free = [i for i, p in enumerate(stage.parameters) if p.tolerance > 0.0]
-    sizes = np.array([0.05 * stage.parameters[i].tolerance for i in free])
+    free = judge.nominal
     before = judge.mean_squares(judge.errors(theta)[0])
     for _ in range(4):  # each leaves a hundredth of an offset that is short against the motion
         at = LeastSquaresProblem(moved(late), floor)
-        tries = np.repeat(theta[None], len(free) + 1, axis=0)
-        tries[np.arange(1, len(free) + 1), free] += sizes
-        e = at.errors(tries)
-        columns = [(e[k + 1] - e[0]).ravel() / sizes[k] for k in range(len(free))]
+        e, slopes = at.nominal_slopes(theta)
+        columns = [one.ravel() for one in slopes]
         for k in range(terms):
             other = late.copy()
             other[k] += 0.5 * LEAST_LATE
             beside = LeastSquaresProblem(moved(other), floor).errors(theta[None])[0]
-            columns.append((beside - e[0]).ravel() / (0.5 * LEAST_LATE))
+            columns.append((beside - e).ravel() / (0.5 * LEAST_LATE))
         scale = np.array([*(stage.parameters[i].tolerance for i in free), *[LATE] * terms])
         a = np.array(columns).T * scale
         prior = np.diag([*[3.0**0.5] * len(free), *[0.0] * terms])
         held = np.array([*((theta[i] - stage.parameters[i].expected) / stage.parameters[i].tolerance for i in free),
                          *[0.0] * terms])  # fmt: skip
-        normal, slope = a.T @ a + prior**2, a.T @ e[0].ravel() + prior**2 @ held
+        normal, slope = a.T @ a + prior**2, a.T @ e.ravel() + prior**2 @ held
         step = np.linalg.lstsq(normal, -slope, rcond=None)[0]
         step *= scale
         theta = theta.copy()

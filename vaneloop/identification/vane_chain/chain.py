@@ -381,8 +381,9 @@ def _chain(
             )
         have["stroke"] = smooth.stroke
     if "linkage" in names and "x_lvdt" in have and resolution(have["x_lvdt"]):
-        digits = [last_digit(have["x_lvdt"], np.random.default_rng(k)) for k in range(NOISE_DRAWS)]
-        off_by = [smooth.smoothed(d) if "stroke" in have else d for d in digits]
+        digit = last_digit(have["x_lvdt"])
+        digits = (digit(np.random.default_rng(k)) for k in range(NOISE_DRAWS))
+        off_by = (smooth.smoothed(d) if "stroke" in have else d for d in digits)
         have[STROKE_OFF] = np.array([passed.before(d, dt) for d in off_by]).T
     if "linkage" in names and "x_lvdt" in have and passed.kind:
         have["stroke"] = passed.before(have.get("stroke", have["x_lvdt"]), dt)

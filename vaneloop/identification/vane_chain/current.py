@@ -72,16 +72,14 @@ def servo_law(
     spline = SplineRates(np.arange(float(len(t))))
     _between(smooth.stroke, spline(smooth.stroke), stroke)
     between = stroke - np.interp(when.ravel(), t, smooth.stroke).reshape(when.shape)
-    stroke[:, -1] = x
-    law = np.empty(when.shape)
-    _loop(*_demanded(x_dem, behind), stroke, *gains, law)
+    law = law_of(x_dem, smooth.stroke, cal, x, behind)
     # not known: the LVDT's noise in nine ticks, what smoothing leaves at the rows, the way between them, which is known
     # as well as a straight line and a cubic agree, and what the last digits of logged demand and stroke hide
-    draw = np.random.default_rng(0)
+    draw, of_stroke, of_demand = np.random.default_rng(0), last_digit(x), last_digit(x_dem)
     of_mean, of_some = np.empty((len(t), draws)), np.empty((len(t), draws))
     off, ticks = stroke, np.empty(when.shape)
     for k in range(draws):
-        digit = last_digit(x, draw)
+        digit = of_stroke(draw)
         left = smooth.left(draw, digit) + smooth.distortion
         _between(left, spline(left), off)
         off += between
@@ -89,7 +87,7 @@ def servo_law(
         ticks *= smooth.white(digit)
         np.subtract(ticks, off, out=off)
         off[:, -1] = -digit
-        _loop(*_demanded(last_digit(x_dem, draw), behind), off, *gains, ticks)
+        _loop(*_demanded(of_demand(draw), behind), off, *gains, ticks)
         of_mean[:, k], of_some[:, k] = ticks.mean(axis=1), samples_of(ticks, samples)
     return law, of_mean, of_some
 
@@ -326,7 +324,7 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = 
 
 
 def _known(c: Mapping[str, Array]) -> Array:
-    """Rows but those between two gaps that miss a sample: what is in a gap counts nowhere."""
+    """Rows that have their samples, and those in a gap, which count nowhere: bool[rows]."""
     return np.asarray((c["missing"] == 0.0) | (c["fresh"] == 0.0))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from controller import Calibration, new_inputs, new_outputs, new_state
@@ -166,9 +168,10 @@ def demand_stage(driven: Driven) -> Stage:
         return stage
     neutral = stage.neutral()[None]
     as_logged, draws = simulate(neutral)[0, 0], []
+    of_demand, of_speed = last_digit(n_dem), _other_noise(t, n_r)
     for k in range(CURRENT_DRAWS):
-        came = last_digit(n_dem, np.random.default_rng(k))
-        other = {"n_dem": n_dem + came, "n_r": n_r + _other_noise(t, n_r, CURRENT_DRAWS + k)}
+        came, read = (of(np.random.default_rng(s)) for of, s in ((of_demand, k), (of_speed, CURRENT_DRAWS + k)))
+        other = {"n_dem": n_dem + came, "n_r": n_r + read}
         run_of_it = simulate(neutral, **other, signals=driven._replace(columns=c | other).signals())[0, 0]
         draws.append(np.where(np.isfinite(measured), run_of_it - as_logged, np.nan))
     by_noise = np.array(draws)
@@ -177,13 +180,12 @@ def demand_stage(driven: Driven) -> Stage:
     return stage
 
 
-def _other_noise(t: Array, values: Array, seed: int) -> Array:
-    """A draw of noise such as a measured channel has: the rounding of its last digit, and white."""
-    draw, hides = np.random.default_rng(seed), resolution(values) / 12.0**0.5
-    size = noise_floor(t, values)
-    white = max(size**2 - hides**2, 0.0)
+def _other_noise(t: Array, values: Array) -> Callable[[np.random.Generator], Array]:
+    """Function that draws noise such as a measured channel has: the rounding of its last digit, and white."""
+    digit, size = last_digit(values), noise_floor(t, values)
+    white = max(size**2 - (resolution(values) / 12.0**0.5) ** 2, 0.0)
     white = np.sqrt(white if white > 0.05 * size**2 else 0.0)
-    return last_digit(values, draw) + white * draw.standard_normal(len(t))
+    return lambda draw: digit(draw) + white * draw.standard_normal(len(t))
 
 
 def _by_noise(t: Array, error: Array, draws: Array, least: float) -> tuple[float, float]:

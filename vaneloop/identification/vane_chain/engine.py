@@ -58,7 +58,8 @@ def engine_stage(driven: Driven) -> Stage:
     stage.made = Made(engine_stage, driven)
     if resolution(c["n_dem"]) and not driven.again:
         neutral = stage.neutral()[None]
-        digits = [last_digit(c["n_dem"], np.random.default_rng(k)) for k in range(NOISE_DRAWS)]
-        draws = [simulate(neutral, logged + between_rows(d))[0] for d in digits]
+        digit = last_digit(c["n_dem"])
+        drawn = (digit(np.random.default_rng(k)) for k in range(NOISE_DRAWS))
+        draws = [simulate(neutral, logged + between_rows(d))[0] for d in drawn]
         expect_draws(stage, np.array(draws) - simulate(neutral)[0])
     return stage

@@ -27,10 +27,11 @@ from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES
 from vaneloop.identification.settings import HUM_CHANCE, HUM_LINES, HUM_NEARBY
 from vaneloop.identification.subsystem import Array
+from vaneloop.identification.vane_chain.resample import DEMANDS
 
 __all__ = ["without_hum"]
 
-ANALOGUE, COMMANDS = ("n_r", "x_lvdt", "i_cmd", *VANES), ("n_dem", "x_dem")
+ANALOGUE = ("n_r", "x_lvdt", "i_cmd", *VANES)
 
 
 def without_hum(log: Log) -> Log:
@@ -38,7 +39,7 @@ def without_hum(log: Log) -> Log:
     is none.
     """
     names = [c for c in ANALOGUE if c in log.channels and not log.channels[c].framed and len(log.channels[c].t) > 1000]
-    commands = [log.channels[c] for c in COMMANDS if c in log.channels and len(log.channels[c].t) > 1]
+    commands = [log.channels[c] for c in DEMANDS if c in log.channels and len(log.channels[c].t) > 1]
     if len(names) < 3 or "n_r" not in names or not commands:
         return log
     step = float(np.median(np.diff(log.channels[names[0]].t)))
@@ -76,10 +77,12 @@ def _common_line(channels: Sequence[Channel], commands: Sequence[Channel], step:
         even = np.zeros(rows)
         even[np.clip(np.rint((c.t[:-3] - first) / step).astype(int), 0, rows - 1)] = z
         least = np.minimum(least, _power(even))
+    least[:4] = 0.0
+    if least.max() <= stands_out:
+        return None
     for c in commands:
         held = c.values[np.maximum(np.searchsorted(c.t, first + step * np.arange(rows), side="right") - 1, 0)]
         least[_power(np.diff(held, 3, append=held[-3:])) > stands_out] = 0.0
-    least[:4] = 0.0
     k = int(np.argmax(least))
     return k / (rows * step) if least[k] > stands_out else None
 

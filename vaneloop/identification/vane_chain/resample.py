@@ -5,7 +5,7 @@ each subsystem has; where channels have gaps; and the conditions under which a s
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -23,6 +23,7 @@ from vaneloop.identification.settings import CONDITION_BAND, RASTER, WINDOW
 from vaneloop.identification.subsystem import Array, Stage
 
 __all__ = [
+    "DEMANDS",
     "OF_SUBSYSTEM",
     "Gaps",
     "Grid",
@@ -44,6 +45,7 @@ __all__ = [
 
 
 CONDITIONS = ("x_lvdt", "n_r", "t_oil", "p_s", "i_cmd")
+DEMANDS = ("n_dem", "x_dem")  # no sensor reads them
 
 
 class OfSubsystem(NamedTuple):
@@ -241,7 +243,7 @@ def _columns(
             columns[name][partly] = np.interp(between, c.t, c.values).mean(axis=1)
         elif (
             uniform and abs(step - dt) < 0.02 * dt and not _between_rows(c, when, dt)
-            or name in ("n_dem", "x_dem", "state") or _held(c, step, dt)
+            or name in (*DEMANDS, "state") or _held(c, step, dt)
         ):  # fmt: skip
             # rows of a regular logger: the nearest row, whatever its clock's jitter; commands and what comes in frames
             # hold their value
@@ -258,7 +260,7 @@ def _columns(
         gone, lacks = away >= 1.5 * max(step, dt), partly | (away > 0.75 * (step if uniform else max(step, dt)))
         if lacks.any():
             far[name], missing[name] = gone, lacks
-            if name in ("n_dem", "x_dem"):
+            if name in DEMANDS:
                 columns[name] = np.where(lacks, np.interp(when, c.t, c.values), columns[name])
     return {name: no_smaller(v) for name, v in columns.items()}, far, missing
 
@@ -300,10 +302,10 @@ def every_other(columns: dict[str, Array], current: Array | None = None) -> dict
     return out
 
 
-def last_digit(values: Array, draw: np.random.Generator) -> Array:
-    """What rounding to a channel's last digit may have taken off it, one draw: it changes where the channel does."""
-    changes = np.cumsum(np.diff(values, prepend=values[:1]) != 0.0)
-    return np.asarray(resolution(values) * draw.uniform(-0.5, 0.5, changes[-1] + 1)[changes])
+def last_digit(values: Array) -> Callable[[np.random.Generator], Array]:
+    """Function that draws the rounding error of a channel's last digit, which changes where the reading does."""
+    step, reading = resolution(values), np.cumsum(np.diff(values, prepend=values[:1]) != 0.0)
+    return lambda draw: np.asarray(step * draw.uniform(-0.5, 0.5, reading[-1] + 1)[reading])
 
 
 def rms(stage: Stage, difference: Array) -> Array:

@@ -171,12 +171,9 @@ def _noise_in(judge: LeastSquaresProblem, k: int, error: Array, made: Array, out
 
 def _of_parameters(judge: LeastSquaresProblem, theta: Array) -> Array:
     """Share of the power of each output's error that a straight step of all nominal parameters together would take."""
-    free = [i for i, p in enumerate(judge.stage.parameters) if p.tolerance > 0.0]
-    tries = np.repeat(theta[None], len(free) + 1, axis=0)
-    tries[np.arange(1, len(free) + 1), free] += [0.05 * judge.stage.parameters[i].tolerance for i in free]
-    e = judge.errors(tries)
+    e, slopes = judge.nominal_slopes(theta)
     out = []
-    for left, columns in zip(e[0], (e[1:] - e[0]).transpose(1, 2, 0), strict=True):
+    for left, columns in zip(e, slopes.transpose(1, 2, 0), strict=True):
         taken = columns @ np.linalg.lstsq(columns, left, rcond=None)[0]
         out.append(float(taken @ taken) / max(float(left @ left), 1e-300))
     return np.array(out)
