@@ -42,6 +42,7 @@ from hil.loop.node import Node
 from hil.loop.pair import COILS, seen
 from plant import build_plant
 from tests.test_tables import document
+from tests.test_two_actuators import short_profile
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path, read
 from vaneloop.cli.main import main
@@ -314,15 +315,7 @@ def test_a_command_that_simulates_takes_two_channels(words: tuple[str, ...]) -> 
 
 
 def test_the_engine_test_takes_two_channels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def numbers(value: float, unit: str) -> str:
-        return f'{{ values = [{value}, {value}], unit = "{unit}", origin = "chosen: for a test" }}'
-
-    profile = tmp_path / "short.toml"
-    profile.write_text(
-        'start = { value = 70, unit = "%", origin = "chosen: for a test" }\n'
-        f"speed = {numbers(75, '%')}\nrate = {numbers(5, '%/s')}\ndwell = {numbers(2, 's')}\n"
-    )
-    said = []
+    profile, said = short_profile(tmp_path), []
     for more in (MACHINE, MACHINE[:2]):
         assert main(["engine-test", *more, "--profile", str(profile), "--json", str(tmp_path / "x.json")]) in (0, 1)
         said.append((tmp_path / "x.json").read_text(encoding="utf-8"))

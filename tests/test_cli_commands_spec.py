@@ -8,30 +8,64 @@ import argparse
 import contextlib
 import importlib
 import json
+import os
 import re
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import can
 import numpy as np
 import pytest
 
+from hil.calibrate.prepare import AtOnce
 from hil.logs import Channel, write_log
+from hil.loop.node import Node
 from hil.loop.realtime import Lateness
+from plant import build_plant
 from tests.page_outline import approve, digest
-from tests.test_page_outlines import TESTED, diagnosis, fit_of, learned, stage, surface
+from tests.test_page_outlines import TESTED, diagnosis, fit_of, group, learned, requirement, stage, surface
+from tests.test_web_pages_spec import links
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path
-from vaneloop.cli import clearance, main
+from vaneloop.base.version import installed_version
+from vaneloop.cli import (
+    ahead,
+    attended,
+    campaign,
+    chains,
+    clearance,
+    compare,
+    completion,
+    demo,
+    engine_test,
+    experiment,
+    export_fmu,
+    fleet,
+    inject,
+    main,
+    new_controller,
+    options,
+    record,
+    replay,
+    run,
+    schedule,
+    station,
+    strategies,
+)
+from vaneloop.cli import map as of_map
+from vaneloop.cli.options import ControllerFailed
+from vaneloop.design.strategies import FIGURES
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.regimes import locate
+from vaneloop.identification.vane_chain.experiment import HEADS
 from vaneloop.pages.page import Page
 
 COMMANDS = [n for n in main.COMMANDS if n != "web"]
@@ -42,8 +76,8 @@ COMMANDS = [n for n in main.COMMANDS if n != "web"]
 
 def taken(parser: argparse.ArgumentParser, at: str = "") -> Iterator[str]:
     """Each option and place of a command, and of its parts."""
-    for group in parser._action_groups:
-        for a in group._group_actions:
+    for section in parser._action_groups:
+        for a in section._group_actions:
             if isinstance(a, argparse._SubParsersAction):
                 yield f"{at}{a.dest}: parts, required {a.required}, by {a._parser_class.__name__}"
                 for name, part in a.choices.items():
@@ -53,7 +87,7 @@ def taken(parser: argparse.ArgumentParser, at: str = "") -> Iterator[str]:
             kind = getattr(a.type, "__name__", a.type)
             about = re.sub(r"\s+", " ", (a.help or "").replace("%(default)s", str(a.default)))
             yield (
-                f"{at}[{group.title}] {' '.join(a.option_strings) or a.dest}: {type(a).__name__} of {kind}, "
+                f"{at}[{section.title}] {' '.join(a.option_strings) or a.dest}: {type(a).__name__} of {kind}, "
                 f"nargs {a.nargs}, default {a.default!r}, const {a.const!r}, choices {a.choices}, "
                 f"required {a.required}, {a.metavar}; {about}"
             )
@@ -342,7 +376,6 @@ def test_names_of_a_log(ran: Ran, log: str) -> None:
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_a_script_for_a_shell(shell: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Of a few commands: one that takes a log, one of parts, one that takes words, one that cannot be imported."""
-    from vaneloop.cli import completion
 
     few = {n: (main.COMMANDS[n][0], f"about '{n}'") for n in ("extend", "fleet", "inject", "ecu", "completion")}
     monkeypatch.setattr(completion, "COMMANDS", {**few, "web": ("vaneloop.no.such.module", "not there")})
@@ -358,7 +391,6 @@ def test_a_script_for_a_shell(shell: str, monkeypatch: pytest.MonkeyPatch, capsy
 def test_the_program_s_own_words(ran: Ran) -> None:
     assert ran() == 2 and ran("--help") == 0 and ran("help") == 0 and ran("-h") == 0 and ran("--version") == 0
     assert ran("diagnoze") == 2 and ran(next(iter(main.IN_CHECKOUT)).split()[0]) == 2
-    from vaneloop.base.version import installed_version
 
     approve("cli_main", ran.text().replace(installed_version(), "VERSION"))
 
@@ -402,7 +434,6 @@ def located() -> list[Any]:
 
 def test_what_the_search_finds_is_printed(ran: Ran, log: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from vaneloop.cli import compare, diagnose, experiment, extend, learn, locate
-    from vaneloop.identification.vane_chain.experiment import HEADS
 
     asked: list[Any] = []
 
@@ -499,9 +530,6 @@ def test_what_the_search_finds_is_printed(ran: Ran, log: str, monkeypatch: pytes
 
 
 def test_the_limits_of_a_run_of_one_s_own(tmp_path: Path) -> None:
-    from vaneloop.base.errors import InputError
-    from vaneloop.cli import experiment
-
     def of(**more: Any) -> Any:
         return experiment._limits(argparse.Namespace(**{"limit": [], "rate": [], "seconds": None} | more))
 
@@ -621,7 +649,6 @@ def test_the_controller_in_real_time(ran: Ran, monkeypatch: pytest.MonkeyPatch) 
     report.failed, report.ticks = "", 0
     assert ran(*bus, "--seed", "2") == 0
     recorder = SimpleNamespace(error="disk full", lost=0, frames=1)
-    from vaneloop.cli import run
 
     exceeded: list[str] = []
     args = argparse.Namespace(record="r.log", quiet=True, json=None)
@@ -660,10 +687,6 @@ def test_the_engine_in_real_time(ran: Ran, log: str, monkeypatch: pytest.MonkeyP
 
 
 def test_a_bus_is_recorded(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
-    import can
-
-    from vaneloop.cli import record
-
     clock = SimpleNamespace(now=10.0)
     said: list[str] = []
     lost = SimpleNamespace(n=0, fails=False)
@@ -715,8 +738,6 @@ def test_a_bus_is_recorded(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_is_compiled_when_the_program_is_set_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from vaneloop.cli import ahead
-
     place = tmp_path / "a" / "ahead"
     asked: list[Any] = []
     good = [True, True]
@@ -751,8 +772,6 @@ def test_what_is_compiled_when_the_program_is_set_up(
 
 
 def test_jobs_are_done_side_by_side(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    from vaneloop.cli import ahead
-
     begun: list[Any] = []
 
     class Popen:
@@ -773,8 +792,6 @@ def test_jobs_are_done_side_by_side(monkeypatch: pytest.MonkeyPatch, capsys: pyt
 
 
 def test_what_a_job_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.cli import ahead
-
     wrote: list[Any] = []
     ran: list[Any] = []
     monkeypatch.setattr(ahead, "write_log", lambda path, columns: wrote.append((path, sorted(columns))))
@@ -800,8 +817,6 @@ def test_what_a_job_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_demonstration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    from vaneloop.cli import demo
-
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["demo"])
     codes: dict[str, int] = {}
@@ -867,8 +882,6 @@ def test_the_demonstration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
 
 
 def test_real_logs_are_found_where_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.cli import demo
-
     monkeypatch.setattr(demo, "ROOT", tmp_path / "product")
     monkeypatch.delenv("VANELOOP_DATA", raising=False)
     assert demo._shared_data() is None
@@ -891,7 +904,6 @@ def test_the_program_is_entered(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(SystemExit) as e:
         main.run()
     assert e.value.code == 7 and terminal.is_command is True
-    import os
 
     assert os.environ["OPENBLAS_NUM_THREADS"] == "1" and type(sys.meta_path[0]).__name__ == "_CanWithoutMdf"
     finder = main._CanWithoutMdf()
@@ -908,7 +920,6 @@ def test_the_program_is_entered(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_fleet_is_begun_worked_on_and_reported(ran: Ran, log: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from tests.test_page_outlines import fleet as view_of
-    from vaneloop.cli import fleet
 
     asked: list[Any] = []
 
@@ -990,8 +1001,6 @@ def test_a_fleet_is_begun_worked_on_and_reported(ran: Ran, log: str, monkeypatch
 
 def test_a_campaign_is_run(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
     from tests.test_page_outlines import campaign as view_of
-    from tests.test_page_outlines import group, requirement
-    from vaneloop.cli import campaign
 
     asked: list[Any] = []
     folder = SimpleNamespace(
@@ -1034,11 +1043,6 @@ def test_a_campaign_is_run(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_strategies_side_by_side(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
-    from dataclasses import dataclass
-
-    from vaneloop.cli import strategies
-    from vaneloop.design.strategies import FIGURES
-
     asked: list[Any] = []
 
     @dataclass
@@ -1115,9 +1119,6 @@ def test_strategies_side_by_side(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_trouble_codes_are_kept_in_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.base.errors import InputError
-    from vaneloop.cli import attended
-
     registered: list[Any] = []
     monkeypatch.setattr(attended.atexit, "register", registered.append)
     monkeypatch.setattr(attended, "time", SimpleNamespace(sleep=registered.append))
@@ -1140,10 +1141,6 @@ def test_trouble_codes_are_kept_in_a_file(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_services_that_attend_to_the_controller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from hil.calibrate.prepare import AtOnce
-    from hil.loop.node import Node
-    from vaneloop.cli import attended
-
     apart: list[int] = []
     monkeypatch.setattr(attended, "Outside", lambda elements: apart.append(1) or AtOnce(elements))
     slaves: list[dict[str, Any]] = []
@@ -1184,8 +1181,6 @@ def test_services_that_attend_to_the_controller(tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_controller_or_a_plant_of_one_s_own(ran: Ran, log: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.cli import export_fmu, replay, run
-
     fed: list[Any] = []
     monkeypatch.setattr(replay, "is_crash_log", lambda log: log == "crash.parquet")
     monkeypatch.setattr(
@@ -1196,7 +1191,6 @@ def test_a_controller_or_a_plant_of_one_s_own(ran: Ran, log: str, monkeypatch: p
     monkeypatch.setattr("vaneloop.cli.options.isolated", lambda call, save: fed.append(save) or call())
     assert ran("replay", "crash.parquet", "--controller", "own.so", "--save-crash", "c.parquet", *J) == 0
     assert ran("replay", "crash.parquet", "--controller", "own.so", "--save-crash", "c.csv") == 2
-    from vaneloop.cli.options import ControllerFailed
 
     def fails(call: Any, save: Any) -> int:
         raise ControllerFailed("own.so: it hung")
@@ -1235,9 +1229,6 @@ def test_a_controller_or_a_plant_of_one_s_own(ran: Ran, log: str, monkeypatch: p
 def test_a_controller_s_project_that_cannot_be_written_leaves_nothing(
     ran: Ran, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from vaneloop.base.errors import InputError
-    from vaneloop.cli import new_controller
-
     def full(contents: Any) -> None:
         raise InputError("the disk is full")
 
@@ -1251,8 +1242,6 @@ def test_a_controller_s_project_that_cannot_be_written_leaves_nothing(
 
 
 def test_a_log_is_put_into_the_subsystems_of_a_machine(log: str, ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.cli import chains
-
     said: list[str] = []
     cached = {"hydraulic": False, "motor": False}
     of = {id(chains.hydraulic_blocks.run): "hydraulic", id(chains.motor_blocks.run): "motor"}
@@ -1281,8 +1270,6 @@ def test_a_log_is_put_into_the_subsystems_of_a_machine(log: str, ran: Ran, monke
 
 
 def test_what_else_is_in_a_log_is_told(ran: Ran, log: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.cli import map as of_map
-
     def row(signal: str, how: str) -> Any:
         return SimpleNamespace(signal=signal, name=f"in the log {signal}", unit="%", how=how, confidence=0.87, low=1.0,
                                high=2.5, curve=np.array([1.0, 2.0]))  # fmt: skip
@@ -1309,9 +1296,6 @@ def test_what_else_is_in_a_log_is_told(ran: Ran, log: str, monkeypatch: pytest.M
 
 
 def test_a_measured_loop_is_scheduled(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
-    from tests.test_web_pages_spec import links
-    from vaneloop.cli import schedule
-
     result = links()
     result.log = "loop.csv"
     for s in result.links:
@@ -1341,10 +1325,6 @@ def test_a_measured_loop_is_scheduled(ran: Ran, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_what_a_node_says(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    from hil.loop.node import Node
-    from plant import build_plant
-    from vaneloop.cli import run, station
-
     args = argparse.Namespace(model="m.toml", quiet=False, json=None, secoc=None, xcp=True, uds=False)
     same = SimpleNamespace(plant=build_plant())
     run._say_engine(args, same, "vcan0")
@@ -1372,9 +1352,6 @@ def test_what_a_node_says(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
 
 
 def test_a_bus_is_joined_left_and_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.base.errors import InputError
-    from vaneloop.cli import station
-
     opened: list[Any] = []
     bus = SimpleNamespace(shutdown=lambda: opened.append("left"))
     monkeypatch.setattr(station, "open_bus", lambda name, **more: opened.append((name, more)) or bus)
@@ -1416,8 +1393,6 @@ def test_a_bus_is_joined_left_and_watched(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_options_are_offered_where_they_count() -> None:
-    from vaneloop.cli import options
-
     def offered(**more: Any) -> set[str]:
         parser = argparse.ArgumentParser()
         options.add_controller_options(parser, **more)
@@ -1433,8 +1408,6 @@ def test_options_are_offered_where_they_count() -> None:
 
 
 def test_a_bar_goes_from_nothing_to_all(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.cli import engine_test
-
     bars: list[tuple[str, list[float]]] = []
 
     @contextmanager
@@ -1522,8 +1495,6 @@ def test_what_stands_at_the_end_of_what_is_allowed_is_taken(
 
 
 def test_frames_are_compiled_for_only_where_a_log_has_some(monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.cli import options
-
     asked: list[Any] = []
     monkeypatch.setattr(options, "warm_up", lambda say: say("compiling") or asked.append(1))
     monkeypatch.setattr(terminal, "say", lambda args, text: asked.append(text))
@@ -1534,8 +1505,6 @@ def test_frames_are_compiled_for_only_where_a_log_has_some(monkeypatch: pytest.M
 
 
 def test_a_scenario_that_cannot_be_is_left_out_among_others(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.cli import inject
-
     asked: list[str] = []
     monkeypatch.setattr(inject, "lacks", lambda scenario, *machine: "no such part")
 
@@ -1550,8 +1519,6 @@ def test_a_scenario_that_cannot_be_is_left_out_among_others(ran: Ran, monkeypatc
 
 
 def test_a_record_is_complete_whatever_ends_the_run(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    from vaneloop.cli import station
-
     closed: list[int] = []
     kept = ["old.log"]
 
@@ -1578,8 +1545,6 @@ def test_a_record_is_complete_whatever_ends_the_run(monkeypatch: pytest.MonkeyPa
 
 
 def test_what_names_a_machine_and_a_log_reaches_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.cli import options
-
     monkeypatch.setattr(options, "Machine", lambda *given: given)
     args = argparse.Namespace(tables="T", model="m.toml", plant="p", controller="c.so")
     assert options.machine_of(args, strategy="dual") == ("T", "m.toml", "dual", "p", "c.so", None)
@@ -1595,8 +1560,6 @@ def test_what_names_a_machine_and_a_log_reaches_them(monkeypatch: pytest.MonkeyP
 
 
 def test_a_model_of_one_s_own_is_compared_without_a_loop(ran: Ran, log: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.cli import compare
-
     shown: list[Any] = []
     monkeypatch.setattr(compare.own_model, "asked", lambda args: True)
     monkeypatch.setattr(compare.own_model, "ask", lambda args, verb: shown.append(verb) or Answered(by_log="the logs"))

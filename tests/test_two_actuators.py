@@ -464,15 +464,22 @@ def test_replay_says_how_far_apart_the_strokes_are_draws_them_and_keeps_them(
     assert "x_lvdt_b: this machine has one actuator; not compared" in replay(log, plant=ONE).notes
 
 
-def test_the_engine_test_says_how_far_apart_the_strokes_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def short_profile(folder: Path) -> Path:
+    """An engine test of some seconds."""
+
     def numbers(value: float, unit: str) -> str:
         return f'{{ values = [{value}, {value}], unit = "{unit}", origin = "chosen: for a test" }}'
 
-    profile = tmp_path / "short.toml"
+    profile = folder / "short.toml"
     profile.write_text(
         'start = { value = 70, unit = "%", origin = "chosen: for a test" }\n'
         f"speed = {numbers(75, '%')}\nrate = {numbers(5, '%/s')}\ndwell = {numbers(2, 's')}\n"
     )
+    return profile
+
+
+def test_the_engine_test_says_how_far_apart_the_strokes_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    profile = short_profile(tmp_path)
     assert main(["engine-test", "--plant", TABLE, "--profile", str(profile)]) in (0, 1)
     assert "dual: x_lvdt_a - x_lvdt_b: " in capsys.readouterr().out
 

@@ -20,6 +20,7 @@ from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import diagnose_stage
 from vaneloop.identification.settings import LEAST_FALL, LEAST_OF_NOISE, LEVEL_SPREAD, NATS
 from vaneloop.identification.subsystem import Array
+from vaneloop.identification.unmodelled import fitted_candidate, problem
 from vaneloop.identification.unmodelled.closed_form_fits import Product, goes_on
 from vaneloop.identification.unmodelled.curve_candidates import (
     Candidate,
@@ -43,7 +44,7 @@ from vaneloop.identification.unmodelled.fitted_candidate import (
 )
 from vaneloop.identification.unmodelled.learned_law import LearnedLaw, LearnedSurface, law_of
 from vaneloop.identification.unmodelled.learning import CurveSearch
-from vaneloop.identification.unmodelled.problem import promises
+from vaneloop.identification.unmodelled.problem import CurveProblem, promises
 from vaneloop.identification.unmodelled.python_law import python_law
 from vaneloop.identification.unmodelled.regressors import Quantity, _alike, difference, quantities
 from vaneloop.identification.unmodelled.screening import best_step, starts_of
@@ -683,8 +684,6 @@ def test_where_parameters_move_without_some_blocks() -> None:
 
 
 def test_of_constants_at_one_place_the_plainest_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.identification.unmodelled import fitted_candidate
-
     def tried(name: str, left: float, cost: float, at: str = "y", grain: float = 1.0) -> Any:
         judge = SimpleNamespace(stage=SimpleNamespace(grain=grain), n=100.0)
         candidate = SimpleNamespace(how="output adds", at=at, name=name, strange=len(name))
@@ -718,8 +717,6 @@ def test_a_line_is_highest_where_a_parabola_says() -> None:
 
 
 def test_a_candidate_is_fitted_where_all_curves_have_settled(monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.identification.unmodelled import problem
-
     asked: list[Any] = []
     judge = SimpleNamespace(sparing=False, fit=lambda *given, **more: asked.append((given, more)) or "the fit")
     own: Any = SimpleNamespace(judge_of=lambda *given: asked.append(given) or judge)
@@ -743,8 +740,6 @@ def test_a_candidate_is_fitted_where_all_curves_have_settled(monkeypatch: pytest
 
 
 def test_what_a_curve_makes_of_each_log() -> None:
-    from vaneloop.identification.unmodelled.problem import CurveProblem
-
     rng = np.random.default_rng(1)
     errors = {log: 3.0 * rng.standard_normal((2, 50)) for log in ("a", "b", "c")}
     errors["b"][0, :3] = np.nan
@@ -792,9 +787,6 @@ def test_what_a_curve_makes_of_each_log() -> None:
 
 
 def test_logs_and_other_subsystems_may_speak_against_a_curve() -> None:
-    from vaneloop.identification.unmodelled import problem
-    from vaneloop.identification.unmodelled.problem import CurveProblem
-
     decided: list[Any] = []
     verdicts: dict[str, bool] = {}
 

@@ -23,11 +23,14 @@ from hil.bus import frames
 from hil.figures import SignalError
 from tests.page_outline import approve
 from tests.test_page_outlines import diagnosis, fit_of, learned, said_of, stage, surface
+from tests.test_page_outlines import fleet as view
+from tests.test_page_outlines import stage as made
 from tests.workbench_page import HELD, Clock, Opened, Transcript, answering, in_a_loop
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.regimes import locate
 from vaneloop.identification.subsystem import Parameter
-from vaneloop.web import fleet, missing, run, schedule
+from vaneloop.pages.fleet import fleet_page
+from vaneloop.web import fleet, missing, run, running, schedule
 from vaneloop.web.choice import LogFile
 from vaneloop.web.jobs import COLUMNS, Cancelled, Job, WorkError
 from vaneloop.web.moments import Moment
@@ -83,7 +86,6 @@ def diagnosed() -> dict[str, Any]:
 
 def refitted(words: list[str], stage: str, effects: tuple[str, ...]) -> dict[str, Any]:
     """The answer of a fit with these effects."""
-    from tests.test_page_outlines import stage as made
 
     s = made(stage)
     d = diagnosis()[0].stages[0]
@@ -621,9 +623,6 @@ def test_the_schedule(monkeypatch: pytest.MonkeyPatch, session: Session) -> None
 
 
 def test_a_run_of_a_fleet(monkeypatch: pytest.MonkeyPatch, session: Session, tmp_path: Path) -> None:
-    from tests.test_page_outlines import fleet as view
-    from vaneloop.pages.fleet import fleet_page
-
     for folder in ("runs/one", "runs/two", ".hidden", "_no", "a/b/c/d/e"):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / "run.json").write_text("{}")
@@ -730,8 +729,6 @@ def test_a_page_looks_again_soon_but_not_too_often(session: Session, monkeypatch
 
 
 def test_a_run_that_hangs_is_ended_and_its_controller_named(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.web import running
-
     clock = Clock(monkeypatch, "running")
     loop: Any = running.Loop(session)
     stopped: list[int] = []

@@ -25,18 +25,27 @@ import pytest
 
 pytest.importorskip("nicegui")
 
+import httpx
+from nicegui import Client
+from nicegui.testing.general import nicegui_reset_globals
+
 from controller import FAULTS
 from hil.bus import frames
 from hil.calibrate import master
 from hil.logs import Channel
 from hil.loop.ecu import builtin
+from plant import load_geometry, load_schedules
 from tests.workbench_page import Clock
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
-from vaneloop.web import command, jobs, loop, private, process, worker
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.regimes import locate
+from vaneloop.verbs.machine import files_of
+from vaneloop.web import command, held, jobs, loop, private, process, server, worker
 from vaneloop.web.charts import Band, Curves, Mark, Over, Panel, Trace, bands, of_log, of_stage, painted, thinned, view
 from vaneloop.web.jobs import AGAIN, COLUMNS, COMPILING, LOADING, Cancelled, Spare, Worker, WorkError
 from vaneloop.web.process import Inbox, parsed
+from vaneloop.web.server import Plain
 from vaneloop.web.xy import MOST, Plane, arrows, plane, xy_figure
 
 # ---- asked for, and answered -----------------------------------------------------------------------------------------
@@ -995,8 +1004,6 @@ def test_a_whole_command_is_run_in_the_worker(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_a_part_of_an_engine_is_read_by_what_it_says(tmp_path: Path) -> None:
-    from vaneloop.verbs.machine import files_of
-
     files = files_of(None)
     assert worker.engine_part(silent, str(files["geometry"]))[0] == "geometry"
     assert worker.engine_part(silent, str(files["schedules"]))[0] == "schedules"
@@ -1009,9 +1016,6 @@ def test_a_part_of_an_engine_is_read_by_what_it_says(tmp_path: Path) -> None:
 
 
 def test_the_steps_of_a_schedule(tmp_path: Path) -> None:
-    from plant import load_geometry, load_schedules
-    from vaneloop.verbs.machine import files_of
-
     files = files_of(None)
     words = ["--geometry", str(files["geometry"]), "--schedules", str(files["schedules"]), "--lb-range", "0.5",
              "--lc-range", "0.5"]  # fmt: skip
@@ -1041,8 +1045,6 @@ def test_the_steps_of_a_schedule(tmp_path: Path) -> None:
 def test_a_comparison_and_its_refits(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of stand-ins for what is held: what is handed on, and what is told on the way."""
     from tests.test_page_outlines import TESTED, by_log, diagnosis, fit_of, stage
-    from vaneloop.identification.least_squares.problem import LeastSquaresProblem
-    from vaneloop.identification.regimes import locate
 
     s = stage()
     floor = np.array([0.05, 0.2])
@@ -1156,8 +1158,6 @@ def test_what_a_fleet_s_run_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_what_a_log_will_need_is_loaded_before_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.web import held
-
     told: list[Any] = []
     monkeypatch.setattr(worker, "warm_up", lambda say: say("compiling"))
     monkeypatch.setattr(worker, "tell_search", lambda say: say("compiling the search"))
@@ -1194,8 +1194,6 @@ class Asked:
     """A browser without a window: it keeps its cookies, and goes to pages."""
 
     def __init__(self, app: Any, port: int):
-        import httpx
-
         there = f"127.0.0.1:{port}"
         self.client = httpx.AsyncClient(
             transport=httpx.ASGITransport(app=app), base_url=f"http://{there}", headers={"accept": "text/html"}
@@ -1209,10 +1207,6 @@ def serving(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, visit: Callable[[Any, SimpleNamespace], Any], loopback: bool = True
 ) -> SimpleNamespace:
     """Serve a folder; ``visit`` it instead of waiting for Ctrl-C. What the server made."""
-    from nicegui import Client
-    from nicegui.testing.general import nicegui_reset_globals
-
-    from vaneloop.web import server
 
     seen = SimpleNamespace(words=[], config=None, spare=[], sessions=None, over=False, options={})
 
@@ -1290,8 +1284,6 @@ def serving(
 def test_pages_curves_and_saved_files_are_given_to_their_session(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from vaneloop.web import server
-
     async def visit(asked: Asked, seen: SimpleNamespace) -> None:
         assert (await asked.get("/")).status_code == 403
         entered = await asked.get(f"/?token={seen.words[0]}")
@@ -1354,8 +1346,6 @@ def test_pages_curves_and_saved_files_are_given_to_their_session(
 def test_a_page_that_cannot_be_made_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from vaneloop.web import server
-
     def build(session: Any, most: int) -> None:
         assert most == 1000
         raise ValueError("no page")
@@ -1375,8 +1365,6 @@ def test_a_page_that_cannot_be_made_says_so(
 
 
 def test_what_libraries_log_is_a_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.web.server import Plain
-
     monkeypatch.setattr(terminal, "defect", lambda e: f"a defect: {e}")
     plain = Plain(logging.WARNING)
 
@@ -1390,8 +1378,6 @@ def test_what_libraries_log_is_a_line(capsys: pytest.CaptureFixture[str], monkey
 
 
 def test_logs_and_models_that_are_offered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from vaneloop.web import server
-
     for name, text in (("b.csv", ""), ("a.MF4", ""), ("no.txt", ""), ("m.py", "System("), ("n.py", "nothing")):
         (tmp_path / name).write_text(text)
     (tmp_path / "folder.csv").mkdir()

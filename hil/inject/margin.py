@@ -31,10 +31,9 @@ __all__ = ["Margin", "margin_of", "margins", "without_distance"]
 
 _TICK = 1e-3  # s
 _UNITS = {
-    "x_dem": "mm", "x_lvdt": "mm", "i_cmd": "mA", "n_dem": "%", "n_r": "%", **dict.fromkeys(SIDES, "mm"),
-    **dict.fromkeys(("x_select_a", "x_select_b"), "mm"), **dict.fromkeys(("i_a", "i_b", "i_coils"), "mA"),
+    **dict.fromkeys(OF_CHANNELS, "-"), "x_dem": "mm", "x_lvdt": "mm", "i_cmd": "mA", "n_dem": "%", "n_r": "%",
+    **dict.fromkeys((*SIDES, "x_select_a", "x_select_b"), "mm"), **dict.fromkeys(("i_a", "i_b", "i_coils"), "mA"),
     **dict.fromkeys(("link_age_a", "link_age_b"), "ms"),
-    **dict.fromkeys([n for n in OF_CHANNELS if n.startswith(("in_", "ch", "mode", "source", "health"))], "-"),
 }  # fmt: skip
 _BROKEN = 1e-9  # a claim that is broken has a share below zero, also where its distance rounds to nothing
 

@@ -78,7 +78,8 @@ class MachineChange:
         self.loop, self.fed, self.engine = node.loop, node.arrays.supply, ecu.arrays
         self.first, self.end = tick_of(action.start), tick_of(action.end)
         self.new = changed_rows(action, node.plant)
-        self.lanes = slice(None) if action.side is None else slice(*{"a": (0, 1), "b": (1, 2)}[action.side])
+        lane = ("a", "b").index(action.side) if action.side else None
+        self.lanes = slice(None) if lane is None else slice(lane, lane + 1)
         self.supply = {i: v for i, v in ((0, action.p_s), (1, action.t_oil)) if v is not None}
         if 0 in self.supply:
             self.supply[0] *= 1e6

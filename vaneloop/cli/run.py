@@ -146,7 +146,6 @@ def command(args: argparse.Namespace) -> int:
         raise InputError("--inputs, --profile and --log exclude each other")
     options.log_options(args, args.profile)
     if not lockstep:
-        options.machine_of(args).calibration.of_one_channel("a bus in real time")
         return _in_real_time(args, name)
     return _repeat(args) if args.inputs else _in_lockstep(args)
 
@@ -218,6 +217,7 @@ def _say_node(args: argparse.Namespace, node: Any) -> None:
 def _in_real_time(args: argparse.Namespace, name: str) -> int:
     authenticator = station.authenticator(args)
     machine = options.machine_of(args)
+    machine.calibration.of_one_channel("a bus in real time")
     node = _node(args, machine)
     _say_engine(args, machine, name)
     ticks = None if args.duration is None else round(args.duration * 1000)
