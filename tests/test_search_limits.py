@@ -437,7 +437,7 @@ def test_rest_is_no_condition_and_motion_is_one_as_before() -> None:
 def test_the_shape_of_what_is_left_is_told_a_tenth_above_the_floor(
     monkeypatch: pytest.MonkeyPatch, times: float, beyond: bool
 ) -> None:
-    said = SimpleNamespace(verdict="missing", excess=1.0 + 0.1 * times, floor=np.ones(1), final=None)
+    said = SimpleNamespace(verdict="missing", criterion="", excess=1.0 + 0.1 * times, floor=np.ones(1), final=None)
     work = workflow._Work([SimpleNamespace()])  # type: ignore[list-item]
     monkeypatch.setattr(workflow, "diagnose_stage", lambda *_, **__: said)
     monkeypatch.setattr(workflow, "floor_of", lambda *_: np.ones(1))

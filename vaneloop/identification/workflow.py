@@ -93,15 +93,27 @@ def _one(work: _Work, i: int, tell: Callable[[], None] | None = None) -> tuple[S
             tell()
 
     d = as_compared(stage, diagnose_stage(stage, floor_of(stage), tick=tick, judged=work.judged))
-    if d.verdict != "missing" and d.criterion == "noise_floor" and not d.final.effects:
+    if d.criterion == "noise_floor":
         d = _as_located(stage, d)
     return d, shape(LeastSquaresProblem(stage, d.floor), d.final) if _leaves(d) else []
 
 
 def _as_located(stage: Stage, d: StageDiagnosis) -> StageDiagnosis:
-    """The answer without an effect as `locate` has it: "unknown" where the stage fails over the whole log or under a
-    condition, "none" where it fits everywhere, though little would have been enough for a search.
+    """The answer as `locate` has it: "none" where the stage fits everywhere with nothing added, though little is enough
+    for a search; without an effect "unknown" where it fails over the whole log or under a condition.
     """
+    if d.verdict == "missing":
+        judge = LeastSquaresProblem(stage, floor_of(stage))
+        if locate(judge, d.base).fails:
+            return d
+        names = ", ".join(d.final.effects)
+        d.notes.append(f"{stage.name} fits everywhere with nothing added; {names} would help, and is not named")
+        return replace(
+            d, verdict="none", floor=judge.floor, final=d.base, error_after=d.error_before, effects=[], onset=None,
+            steps=d.steps[:1], excess=rms_of(judge, d.base), recalibrated=recalibrated(stage, d.base),
+        )  # fmt: skip
+    if d.final.effects:
+        return d
     located = locate(LeastSquaresProblem(stage, d.floor), d.final)
     if d.verdict == "none" and located.hot:
         return replace(d, verdict="unknown", refused=[f"fails at {located.hot[0].worst()}"])

@@ -161,12 +161,10 @@ def late_vanes(stages: Sequence[Stage]) -> LateIn:
     if stage is None or len(stage.outputs) < 2 or _fits(stage):
         return {}
     t, c = stage.t, stage.made.driven.columns  # type: ignore[attr-defined]
-    length = max(float(np.ptp(t)), 1.0)
-    middle = 0.5 * float(t[0] + t[-1])
+    length, middle, by_clock = float(np.ptp(t)), 0.5 * float(t[0] + t[-1]), _by_clock(stage)
 
     def shifted(late: Array) -> dict[str, Array]:
-        d = -(late[0] + late[1] * (t - middle) / length)
-        return {name: _shifted(t, c[name], d) for name in ("x_lvdt", "stroke", "n_r") if name in c}
+        return {name: _shifted(t, c[name], by_clock(late)) for name in ("x_lvdt", "stroke", "n_r") if name in c}
 
     late, before, after = _fit(stage, _moving(stage, shifted), 2)
     if not _explains(stage, before, after) or np.any(np.abs(late) >= LATE):
@@ -175,6 +173,14 @@ def late_vanes(stages: Sequence[Stage]) -> LateIn:
         return {}
     drift = float(late[1]) if abs(late[1]) > 2.0 * LEAST_LATE else 0.0  # less at either end of the log
     return {"linkage": (Late(stage.outputs, float(late[0]), drift / length, middle),)}
+
+
+def _by_clock(stage: Stage) -> Callable[[Array], Array]:
+    """Function from by how much (s) the vane angles stand late at the middle of the log, and by how much more at its
+    end than at its start, to the times at which the stroke is what it was for them, less those of the rows.
+    """
+    place = (stage.t - 0.5 * (stage.t[0] + stage.t[-1])) / np.ptp(stage.t)
+    return lambda late: np.asarray(-(late[0] + late[1] * place))
 
 
 def _judged(stages: Sequence[Stage]) -> dict[str, Stage]:
@@ -246,46 +252,56 @@ def _servo(stage: Stage) -> list[Late]:
         found.append(least(last, late + fine, here, demands(late + fine), as_logged[1]))
         _, late, other = least(last, grid, grid, d, x)
         found.append(least(last, late + fine, other + fine, demands(late + fine), strokes(other + fine)))
-    best = min(found)
-    noise = float(stage.floor[0]) ** 2 * len(current)  # type: ignore[index]
-    if as_is - best[0] < EXPLAINED * max(as_is - noise, 0.0):
-        return []
+    best, noise = min(found)[0], float(stage.floor[0]) ** 2  # type: ignore[index]
     # the fewer channels have to move, the better
-    near = [f for f in found if f[0] - best[0] <= MOVES_ALIKE * (as_is - best[0])]
+    near = [f for f in found if f[0] - best <= MOVES_ALIKE * (as_is - best)]
     left, late_demand, late_stroke = min(near, key=lambda f: (f[2] != 0.0, f[0]))
-    passed = LowPass(late=-late_demand)
-    if late_demand < -LEAST_LATE:  # all else is late: behind a low-pass, maybe
-        own = current[None] - np.array(strokes(np.array([late_stroke]))[0])
+    # all else is behind a low-pass, maybe, whose recorder's clock may be early by more than that
+    own = current[None] - np.array(strokes(np.array([late_stroke]))[0])
 
-        def left_by(passed: LowPass) -> tuple[Array, Array]:
-            e = own - np.array(demanded(passed, c["x_dem"]))
-            return e if late_stroke else e - np.outer(e @ shared, shared), np.array(demanded(passed, hidden))
+    def left_by(passed: LowPass) -> tuple[Array, Array]:
+        e = own - np.array(demanded(passed, c["x_dem"]))
+        return e if late_stroke else e - np.outer(e @ shared, shared), np.array(demanded(passed, hidden))
 
-        tried = [_low_pass(kind, -late_demand, left_by) for kind in LOW_PASSES]
-        _, passed = min([*tried, (left, passed)], key=lambda x: x[0])
+    delays = [rows * float(t[1] - t[0]) for rows in LOW_PASS_ROWS] + [-late_demand] * (late_demand < -LEAST_LATE)
+    begin = min((LowPass("second order", d, -late_demand - d) for d in delays), key=lambda x: _left(left_by(x)).min())
+    tried = min((_low_pass(begin._replace(kind=kind), left_by) for kind in LOW_PASSES), key=lambda x: x[0])
+    left, passed = tried if left - tried[0] > _chance(noise) else (left, LowPass(late=-late_demand))
+    if as_is - left < EXPLAINED * max(as_is - noise * len(current), 0.0):
+        return []
     lates = (Late(DEMAND, -passed.delay - passed.late, passed=passed), Late(("x_lvdt",), late_stroke))
     return [one for one in lates if abs(one.seconds) > LEAST_LATE]
 
 
-def _low_pass(kind: str, delay: float, errors: Callable[[LowPass], tuple[Array, Array]]) -> tuple[float, LowPass]:
-    """The low-pass of a kind, and how late it stands besides, that leave least near this ``delay`` (s). Returns what is
-    left, squared, and it.
+def _left(errors: tuple[Array, Array]) -> Array:
+    """Sum of squares of errors, less that of what noise makes of them: each float64[kinds of sample, values]."""
+    of, by_noise = errors
+    return np.asarray(np.sum(of**2, axis=1) - np.sum(by_noise**2, axis=1))
+
+
+def _low_pass(begin: LowPass, errors: Callable[[LowPass], tuple[Array, Array]]) -> tuple[float, LowPass]:
+    """The low-pass of the kind of ``begin``, and how late it stands besides, that leave least near that. Returns what
+    is left, squared, and it.
 
     errors  what a low-pass leaves, and what it makes of a draw of the noise of what passed it, each float64[kinds of
             sample, values]. Least squares of the first less those of the second: else the low-pass that takes most off
             the noise would be the best (Soederstroem, Automatica 43 (2007) 939, bias-compensated least squares)
     """
+
+    def of(at: Array) -> LowPass:
+        return begin._replace(delay=float(at[0]), late=float(at[1]))
+
     found = []
     for sample in (0, 1):
-        at, best = np.array([delay, 0.0]), (np.inf, AS_LOGGED)
+        at, best = np.array([begin.delay, begin.late]), (np.inf, AS_LOGGED)
         for _ in range(4):
-            e = [x[sample] for x in errors(LowPass(kind, *at))]
-            best = min(best, (float(e[0] @ e[0] - e[1] @ e[1]), LowPass(kind, *at)))
+            e, noise_of = (x[sample] for x in errors(of(at)))
+            best = min(best, (float(e @ e - noise_of @ noise_of), of(at)))
             step = 0.2 * LEAST_LATE
-            beside = [errors(LowPass(kind, *(at + d))) for d in step * np.eye(2)]
-            own, noise = (np.array([(x[k][sample] - e[k]) / step for x in beside]) for k in (0, 1))
-            at = at - np.linalg.lstsq(own @ own.T - noise @ noise.T, own @ e[0] - noise @ e[1], rcond=None)[0]
-            at[0] = np.clip(at[0], 0.5 * delay, 2.0 * delay)
+            beside = [errors(of(at + d)) for d in step * np.eye(2)]
+            own, noise = (np.array([(x[k][sample] - now) / step for x in beside]) for k, now in ((0, e), (1, noise_of)))
+            at = at - np.linalg.lstsq(own @ own.T - noise @ noise.T, own @ e - noise @ noise_of, rcond=None)[0]
+            at[0] = np.clip(at[0], 0.5 * begin.delay, 2.0 * begin.delay)
         found.append(best)
     return min(found)
 
@@ -349,7 +365,12 @@ def _explains(stage: Stage, before: Array, after: Array) -> bool:
 def _significant(stage: Stage, before: Array, after: Array) -> bool:
     """Whether errors have become less by as many nats as an effect must gain."""
     samples = np.isfinite(stage.measured).sum(axis=1)
-    return float((before - after) @ samples) > 2.0 * COLOUR[1] * NATS
+    return float((before - after) @ samples) > _chance(1.0)
+
+
+def _chance(power: float) -> float:
+    """By how much chance may lessen the sum of squares, where noise has this mean square."""
+    return 2.0 * COLOUR[1] * NATS * power
 
 
 def _moving(
@@ -404,7 +425,7 @@ def _both_passed(stage: Stage) -> LowPass:
     if _fits(stage):
         return AS_LOGGED
     t, c = stage.t, stage.made.driven.columns  # type: ignore[attr-defined]
-    dt = float(t[1] - t[0])
+    dt, by_clock = float(t[1] - t[0]), _by_clock(stage)
     stroke = c.get("stroke", c["x_lvdt"])
 
     def behind(kind: str, start: float, fixed: bool) -> tuple[float, LowPass, Array]:
@@ -413,13 +434,13 @@ def _both_passed(stage: Stage) -> LowPass:
         """
 
         def passed(late: Array) -> LowPass:
-            return LowPass(kind, start if fixed else abs(float(late[1]))) if kind else AS_LOGGED
+            return LowPass(kind, start if fixed else abs(float(late[2]))) if kind else AS_LOGGED
 
         def moved(late: Array) -> Stage:
-            before = _shifted(t, passed(late).before(stroke, dt), -late[0])
+            before = _shifted(t, passed(late).before(stroke, dt), by_clock(late[:2]))
             return _moving(stage, lambda _: {"stroke": before}, passed(late))(late)
 
-        begin, most = (np.array(x)[: 1 if fixed else 2] for x in ([0.0, start], [LATE, np.inf]))
+        begin, most = (np.array(x)[: 2 if fixed else 3] for x in ([0.0, 0.0, start], [LATE, LATE, np.inf]))
         late, _, after = _fit(stage, moved, len(begin), start=begin, most=most)
         return float(after.sum()), passed(late), after
 
