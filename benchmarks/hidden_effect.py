@@ -44,6 +44,7 @@ from vaneloop.base.durations import named_lag, within_no_period
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.settings import LIKELY
 from vaneloop.identification.vane_chain.chain import build_chain
 from vaneloop.identification.vane_chain.experiment import recommend
 from vaneloop.identification.vane_chain.parameters import SHAPES
@@ -76,7 +77,6 @@ MACHINES = {"hydraulic": "plant.toml", "electromechanical": "plant_electromechan
 LEAVE_OUT = "left out"  # a kind of its own
 IN_CONTROLLER = ("trend_threshold_error",)  # the rig's controller has it from the start or not at all
 ONSET_NEAR = 2.0  # s, by which an onset may be off
-LIKELY = 0.5  # a name less probable than this needs a rival
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -36,6 +36,8 @@ from vaneloop.identification.results import (
 )
 from vaneloop.identification.selection.calibration import trust
 from vaneloop.identification.selection.diagnosis import extend_stage
+from vaneloop.identification.selection.rules import PROBABLE
+from vaneloop.identification.settings import LIKELY
 from vaneloop.identification.subsystem import Array
 
 # docs/settings.md
@@ -657,6 +659,59 @@ def test_an_answer_unknown_is_none_where_the_stage_fits_everywhere(size: float, 
     refused = said((), "unknown", final=final)
     refused.refused = ["a explains 20% of what exceeds the noise"]
     assert workflow._as_located(stage, refused) is refused
+
+
+@pytest.mark.parametrize(("size", "verdict"), [(0.3, "none"), (1.0, "missing")])
+def test_no_name_is_given_where_the_stage_fits_everywhere_without_it(size: float, verdict: str) -> None:
+    """A size whose gain is a thousand nats, and makes 4 % of the error or 41 %."""
+    n, rng = 30_000, np.random.default_rng(6)
+    x = np.array([np.ones((1, n)), FLOOR[0] * rng.standard_normal((1, n))])
+    measured = 1.2 + size * x[1] + FLOOR[0] * rng.standard_normal((1, n))
+    stage = stage_on(DT * np.arange(n), x, measured, ("a",), ("y",))
+    d, _ = workflow._one(workflow._Work([stage]), 0)
+    assert d.verdict == verdict and [f.effect for f in d.effects] == ["a"] * (verdict == "missing")
+    if verdict == "none":
+        assert d.final is d.base and np.array_equal(d.error_after, d.error_before) and d.steps[1:] == []
+        assert d.notes == ["s fits everywhere with nothing added; a would help, and is not named"]
+        assert d.recalibrated == recalibrated(stage, d.base)
+
+
+@pytest.mark.parametrize(
+    ("left", "falls", "names"),
+    [
+        (1.09, (1.05, 1.05), ["a", "b"]),  # it fits with them
+        (1.4, (9.0, 9.0), ["a", "b"]),
+        (1.4, (9.0, 1.05), ["a"]),
+        (1.4, (1.05, 1.05), []),
+    ],
+)
+def test_where_a_stage_fails_with_its_names_an_improbable_one_goes(
+    left: float, falls: tuple[float, float], names: list[str]
+) -> None:
+    stage = two(9)
+    judge = LeastSquaresProblem(stage, FLOOR)
+    base, final = (judge.fit(e, stage.neutral()) for e in ((), ("a", "b")))
+    effects = [Found(e, 0.0, {}, [], 20.0, fall=f) for e, f in zip("ab", falls, strict=True)]
+    d = said((), "missing", floor=FLOOR, base=base, final=final, error_after=np.array([1.0, left]) * FLOOR,
+             effects=effects, steps=[("nominal", 9.0), ("a + b", left)])  # fmt: skip
+    out = workflow._probable(stage, d)
+    assert [f.effect for f in out.effects] == names and out.verdict == ("missing" if names else "unknown")
+    assert out.final.effects == tuple(names)
+    low = trust("noise_floor", {"left": left, "fall": 1.05, "share": 1.0})
+    assert low < LIKELY < trust("noise_floor", {"left": left, "fall": 9.0, "share": 1.0})
+    why = [f"{e} has a probability of {low:.2g}, and the subsystem fails with it" for e in "ab" if e not in names]
+    if len(names) == 2:
+        assert out is d
+    elif names:
+        alone = judge.fit(("a",), stage.neutral())
+        assert out.notes == why and out.steps[-1] == ("a", out.excess)
+        assert out.final.theta == pytest.approx(alone.theta, abs=1e-3)
+        assert out.error_after == pytest.approx(rms_per_output(judge, alone), rel=1e-3)
+        assert out.effects[0].parameters == parameters_of(stage, out.final, "a")
+    else:
+        assert out.refused == why and out.nearest == ["a", "b"] and out.final is base and out.steps == d.steps[:1]
+    if left > 1.1:
+        assert {x.rule for one in out.decisions for x in one.verdicts} == {PROBABLE.name}
 
 
 @pytest.mark.parametrize(

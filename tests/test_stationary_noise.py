@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,8 +27,10 @@ from vaneloop.identification.vane_chain.stationary_noise import (
     _of_parameters,
     _over_blocks,
     bounded,
+    expect_stationary_noise,
     like,
 )
+from vaneloop.identification.vane_chain.subsystem_data import Made
 from vaneloop.identification.workflow import diagnose
 
 DT, ROWS = 0.01, 30_000
@@ -122,7 +125,34 @@ def test_an_error_that_its_output_does_not_show_where_it_is_quiet_is_no_noise_of
 def test_an_excess_that_the_bins_could_not_tell_is_not_taken_for_noise() -> None:
     white = np.random.default_rng(2).standard_normal(ROWS)
     assert said(white) == Expected(FLOOR, 0.0)
-    assert said(1.02 * white) is None
+    little = said(1.02 * white)
+    assert little is not None and not little.told
+
+
+def test_neighbouring_bins_count_as_one_where_each_alone_could_not_tell() -> None:
+    white = np.random.default_rng(2).standard_normal(ROWS)
+    more = said(1.04 * white)
+    assert more is not None and more.told  # eight bins are known to 2.3 % each, and two to 1.2 %
+    assert said(white * np.where(SPEED > 0.0, 1.15, 1.0)) is None  # as much, but in motion one way alone
+
+
+@pytest.mark.parametrize(("least", "expects"), [(1.04, True), (1.02, False)])
+def test_of_outputs_with_one_recorder_one_must_tell(least: float, expects: bool) -> None:
+    white = np.random.default_rng(3).standard_normal((2, ROWS)) * np.array([[1.02], [least]])
+    regimes = {"stroke speed": SPEED, "direction": np.sign(SPEED), "time": T}
+
+    def made(driven: object) -> Stage:
+        return Stage("linkage", ("vigv", "vgv1"), ("deg", "deg"), (), (), lambda p: np.zeros((len(p), 2, ROWS)), T,
+                     white, regimes=regimes, floor=np.full(2, FLOOR), memory=10.0)  # fmt: skip
+
+    stage = made(None)
+    stage.noise = lambda when, error: FLOOR
+    columns = {c: np.cumsum(SPEED) * DT + w for c, w in zip(("vigv", "vgv1"), white, strict=True)}
+    stage.made = Made(made, SimpleNamespace(columns=columns))  # type: ignore[arg-type]
+    said = expect_stationary_noise([stage])
+    assert bool(said) == expects
+    if expects:
+        assert stage.floor == pytest.approx([1.02, least], rel=0.01)
 
 
 def test_noise_through_a_gain_is_expected_where_the_gain_is() -> None:

@@ -19,7 +19,7 @@ from vaneloop.identification.regimes import Located, Shape, StageFigures, agrees
 from vaneloop.identification.results import StageDiagnosis, parameters_of, recalibrated, rms_of, rms_per_output, weigh
 from vaneloop.identification.selection.diagnosis import Judged, diagnose_stage, extend_stage, floor_of
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance, as_close, significant
-from vaneloop.identification.selection.rules import decisions_json
+from vaneloop.identification.selection.rules import PROBABLE, Decisions, decisions_json
 from vaneloop.identification.settings import LOOK_EVERY, NATS, SHORT_SEARCH, SIZES_AGREE, USUAL_FITS
 from vaneloop.identification.subsystem import Stage, StageError
 
@@ -95,6 +95,8 @@ def _one(work: _Work, i: int, tell: Callable[[], None] | None = None) -> tuple[S
     d = as_compared(stage, diagnose_stage(stage, floor_of(stage), tick=tick, judged=work.judged))
     if d.criterion == "noise_floor":
         d = _as_located(stage, d)
+        if d.verdict == "missing":
+            d = _probable(stage, d)
     return d, shape(LeastSquaresProblem(stage, d.floor), d.final) if _leaves(d) else []
 
 
@@ -120,6 +122,34 @@ def _as_located(stage: Stage, d: StageDiagnosis) -> StageDiagnosis:
     if d.verdict == "unknown" and not d.refused and not located.fails:
         return replace(d, verdict="none", nearest=[])
     return d
+
+
+def _probable(stage: Stage, d: StageDiagnosis) -> StageDiagnosis:
+    """The answer; where the stage fails with its names, without those that are improbable."""
+    weigh(d)
+    if agrees(float(np.max(d.error_after / d.floor)), 1.0):
+        return d
+    decisions, doubted = Decisions(d.decisions), dict[str, str]()
+    for f in d.effects:
+        together = sum(f.probabilities.values())
+        if not decisions.decide([PROBABLE], together, (f.effect,), [g.effect for g in d.effects if g is not f]):
+            doubted[f.effect] = f"{f.effect} has a probability of {together:.2g}, and the subsystem fails with it"
+    d.decisions = list(decisions)
+    if not doubted:
+        return d
+    left = [f for f in d.effects if f.effect not in doubted]
+    judge = LeastSquaresProblem(begun(stage, onset_of(stage, d.final.theta)), d.floor)
+    fit = _with(judge, {f.effect: d.final for f in left}) if left else d.base
+    d = replace(
+        d, verdict="missing" if left else "unknown", final=fit, error_after=rms_per_output(judge, fit),
+        effects=[replace(f, parameters=parameters_of(stage, fit, f.effect)) for f in left], excess=rms_of(judge, fit),
+        recalibrated=recalibrated(stage, fit),
+    )  # fmt: skip
+    if left:
+        return replace(
+            d, steps=[*d.steps[:-1], (" + ".join(fit.effects), d.excess)], notes=[*d.notes, *doubted.values()]
+        )
+    return replace(d, nearest=list(doubted)[:3], refused=list(doubted.values()), steps=d.steps[:1], onset=None)
 
 
 def as_compared(stage: Stage, d: StageDiagnosis) -> StageDiagnosis:

@@ -17,6 +17,7 @@ A number that is not finite never meets a limit.
 | `NAMED` | each effect before it is named | `Naming` |
 | `EXPLAINS_HALF`, `LEAVES_LITTLE` | the whole set, where the noise is known | `Remainder` |
 | `LEAVES_A_QUARTER` | the whole set, where it is not | `Remainder` |
+| `PROBABLE` | each name of a subsystem that fails with all of them | a number |
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ from vaneloop.identification.settings import (
     LEAST_SHARE,
     LEAST_USE,
     LEFT_FLOORS,
+    LIKELY,
     MOST_LEFT,
     NATS,
     NEGATIVE_STOPS,
@@ -55,7 +57,8 @@ from vaneloop.identification.subsystem import Array
 
 __all__ = [
     "AWAY", "BEGINS", "CONFIRMED", "DISSIPATES", "EXCESS", "EXPLAINS_HALF", "GAIN", "HARMS_NONE", "KNOWN_NOISE",
-    "LEAVES_A_QUARTER", "LEAVES_LITTLE", "NAMED", "NEAR_NOISE", "OTHER_LOGS", "RULES", "SUITS_ALL", "UNKNOWN_NOISE",
+    "LEAVES_A_QUARTER", "LEAVES_LITTLE", "NAMED", "NEAR_NOISE", "OTHER_LOGS", "PROBABLE", "RULES", "SUITS_ALL",
+    "UNKNOWN_NOISE",
     "AllRows", "Beginning", "Comparison", "Confirmation", "Decision", "Decisions", "LogChanges", "Naming", "Remainder",
     "Rule", "Verdict", "decisions_json", "gain",
 ]  # fmt: skip
@@ -525,12 +528,17 @@ LEAVES_A_QUARTER = Rule[Remainder](
     "A set that leaves more than a quarter of the sum of squares beyond noise is not named.",
     lambda r: r.share_left, lambda _: MOST_LEFT, at_most=True, applies=lambda r: r.after > UNKNOWN,
 )  # fmt: skip
+PROBABLE = Rule[float](
+    "probability", "1",
+    "A subsystem that fails with its names lacks something else, too: each must be more probable than not.",
+    lambda p: p, lambda _: LIKELY,
+)  # fmt: skip
 
 RULES: dict[str, Rule[Any]] = {
     rule.name: rule
     for rule in (
         *KNOWN_NOISE, *UNKNOWN_NOISE, AWAY, BEGINS, *NEAR_NOISE, DISSIPATES, CONFIRMED, *OTHER_LOGS, SUITS_ALL, *NAMED,
-        EXPLAINS_HALF, *LEAVES_LITTLE, LEAVES_A_QUARTER,
+        EXPLAINS_HALF, *LEAVES_LITTLE, LEAVES_A_QUARTER, PROBABLE,
     )
 }  # fmt: skip
 

@@ -252,7 +252,8 @@ def _servo(stage: Stage) -> list[Late]:
         found.append(least(last, late + fine, here, demands(late + fine), as_logged[1]))
         _, late, other = least(last, grid, grid, d, x)
         found.append(least(last, late + fine, other + fine, demands(late + fine), strokes(other + fine)))
-    best, noise = min(found)[0], float(stage.floor[0]) ** 2  # type: ignore[index]
+    best, chance = min(found)[0], _chance(float(stage.floor[0]) ** 2)  # type: ignore[index]
+    noise = float(stage.floor[0]) ** 2 * len(current)  # type: ignore[index]
     # the fewer channels have to move, the better
     near = [f for f in found if f[0] - best <= MOVES_ALIKE * (as_is - best)]
     left, late_demand, late_stroke = min(near, key=lambda f: (f[2] != 0.0, f[0]))
@@ -266,11 +267,13 @@ def _servo(stage: Stage) -> list[Late]:
     delays = [rows * float(t[1] - t[0]) for rows in LOW_PASS_ROWS] + [-late_demand] * (late_demand < -LEAST_LATE)
     begin = min((LowPass("second order", d, -late_demand - d) for d in delays), key=lambda x: _left(left_by(x)).min())
     tried = min((_low_pass(begin._replace(kind=kind), left_by) for kind in LOW_PASSES), key=lambda x: x[0])
-    left, passed = tried if left - tried[0] > _chance(noise) else (left, LowPass(late=-late_demand))
-    if as_is - left < EXPLAINED * max(as_is - noise * len(current), 0.0):
+    # what is late may be so by a low-pass or by a clock, alike; what is not needs a reason to have passed one
+    gain = chance if late_demand < -LEAST_LATE else max(chance, EXPLAINED * left)
+    left, passed = tried if left - tried[0] > gain else (left, LowPass(late=-late_demand))
+    if as_is - max(left, noise) < max(EXPLAINED * (as_is - noise), chance):
         return []
     lates = (Late(DEMAND, -passed.delay - passed.late, passed=passed), Late(("x_lvdt",), late_stroke))
-    return [one for one in lates if abs(one.seconds) > LEAST_LATE]
+    return [one for one in lates if one.seconds or one.passed.kind]
 
 
 def _left(errors: tuple[Array, Array]) -> Array:
