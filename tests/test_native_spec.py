@@ -5,13 +5,18 @@ its process is told.
 from __future__ import annotations
 
 import ctypes
+import faulthandler
 import gc
 import json
 import os
+import resource
 import signal
 import struct
+import sys
+import tempfile
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -144,6 +149,167 @@ def test_a_calibration_is_the_same_memory_twice_once_to_write() -> None:
     assert not set(addresses) & set(_VIEWS)
 
 
+# ---- what a library is given, and what it says -----------------------------------------------------------------------
+
+
+def test_what_a_controller_reads_it_cannot_make_writable() -> None:
+    before = len(os.listdir("/proc/self/fd"))
+    mine = readable(CAL)
+    assert len(os.listdir("/proc/self/fd")) == before + 2  # which the two mappings have
+    page = _VIEWS[mine.k.ctypes.data]
+    assert page % 4096 == 0 and program._libc.mprotect(page, 4096, 3) != 0
+    assert program._libc.mprotect(mine.k.ctypes.data, 4096, 3) == 0  # ours is ours
+    assert mine.program is None
+
+
+def test_memory_to_write_to_lies_between_two_walls() -> None:
+    room = program._walled(5)
+    begin = room.ctypes.data // 4096 * 4096
+    spans = {}
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        ends, rights = line.split()[:2]
+        first, last = (int(end, 16) for end in ends.split("-"))
+        spans[range(first, last)] = rights
+
+    def rights(at: int) -> str:
+        return next(r for span, r in spans.items() if at in span)
+
+    assert room.ctypes.data + 8 * room.size == begin + 4096 and room.size == CANARIES + 5
+    assert [rights(begin + d)[:2] for d in (-4096, -1, 0, 4095, 4096, 8191)] == ["--", "--", "rw", "rw", "--", "--"]
+
+
+def test_the_copy_that_was_loaded_is_no_file_any_more(
+    good: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    foreign = Program(good).start(CAL)
+    assert list(tmp_path.iterdir()) == [] and foreign.box[CALL] == STEP
+    monkeypatch.setattr(program, "_MOST_STATE", 8)
+    assert save(foreign) == bytes(8)
+    monkeypatch.setattr(program, "_MOST_STATE", 7)
+    with pytest.raises(InputError) as e:
+        save(foreign)
+    assert str(e.value) == f"--controller {good}: vaneloop_save returned 8 bytes; allowed: 7"
+
+
+def test_what_it_says_of_itself_is_read_in_its_own_memory() -> None:
+    values = (ctypes.c_double * 3)(1.5, 2.5, 3.5)
+    at = [ctypes.cast(ctypes.byref(values, 8 * i), program._Doubles) for i in range(3)]
+    scalars = (program._OwnScalar * 2)(
+        (b"a", b"A", "\u00e9".encode(), at[0], -1.0, 4.0), (b"b", None, b"\xff", at[1], 0.0, 9.0)
+    )
+    shown = (program._OwnObservable * 2)((b"seen", b"%", b"m", at[2]), (b"seen", b"%", b"m", at[2]))
+    told = program._Description(2, 1, scalars, shown)
+    head = np.zeros(N_HEAD)
+
+    def describe() -> Any:
+        assert head[CALL] == 4.0  # its pointers may lead anywhere
+        return ctypes.pointer(told)
+
+    running = program._Running("--controller c.so", SimpleNamespace(vaneloop_describe=describe), None, CAL, head)  # type: ignore[arg-type]
+    found = running.described("scalar")
+    assert {n: {k: v for k, v in q.items() if k != "value"} for n, q in found.items()} == {
+        "a": {"unit": "A", "meaning": "\u00e9", "low": -1.0, "high": 4.0},
+        "b": {"unit": "", "meaning": "\ufffd", "low": 0.0, "high": 9.0},
+    }
+    found["a"]["value"][0] = 7.0
+    assert values[0] == 7.0 and found["b"]["value"].shape == (1,) and head[CALL] == STEP
+    assert list(running.described("observable")) == ["seen"]
+    start = "--controller c.so: vaneloop_describe"
+    for change, said in (
+        (
+            {"observables": 2},
+            f"{start}: observable 1 (='seen'): a name of its own and a pointer to its value are needed",
+        ),
+        ({"observables": -1}, f"{start}: observables (=-1) must be in [0, 10000]"),
+        ({"observables": 10_001}, f"{start}: observables (=10001) must be in [0, 10000]"),
+        ({"observables": 1, "observable": None}, f"{start}: observables (=1 at NULL) must be in [0, 10000]"),
+    ):
+        for name, value in change.items():
+            setattr(told, name, ctypes.POINTER(program._OwnObservable)() if value is None else value)
+        with pytest.raises(InputError) as e:
+            running.described("observable")
+        assert str(e.value) == said
+    told.observables = 0
+    assert running.described("observable") == {}
+    for row, name in (((b"", b"", b"", at[2]), ""), ((b"q", b"", b"", program._Doubles()), "q")):
+        shown[0] = program._OwnObservable(*row)
+        told.observables, told.observable = 1, ctypes.cast(shown, ctypes.POINTER(program._OwnObservable))
+        with pytest.raises(InputError, match=rf"observable 0 \(='{name}'\)"):
+            running.described("observable")
+    nothing = ctypes.POINTER(program._Description)()
+    silent = program._Running("c", SimpleNamespace(vaneloop_describe=lambda: nothing), None, CAL, head)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"^c: vaneloop_describe returned NULL; a vaneloop_description is needed$"):
+        silent.described("scalar")
+    plain = program._Running("c", SimpleNamespace(), None, CAL, head)  # type: ignore[arg-type]
+    assert plain.described("scalar") == {}
+
+
+def test_rounding_is_what_it_was_whatever_a_library_sets() -> None:
+    down = 0x400  # FE_DOWNWARD of x86; where another machine has none of this number, nothing is changed
+    before = program._libm.fegetround()
+    with program._arithmetic_kept():
+        program._libm.fesetround(down)
+    assert program._libm.fegetround() == before
+    with pytest.raises(ValueError, match="x"), program._arithmetic_kept():
+        program._libm.fesetround(down)
+        raise ValueError("x")
+    assert program._libm.fegetround() == before
+
+
+@pytest.mark.parametrize(
+    ("name", "bits", "number"),
+    [("x86_64", 64, 62), ("aarch64", 64, 183), ("i686", 32, 3), ("armv7l", 32, 40), ("ppc64le", 64, 21)],
+)
+def test_a_library_of_another_machine_is_named(
+    name: str, bits: int, number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "c.so"
+    monkeypatch.setattr(program.platform, "machine", lambda: name)
+    file.write_bytes(elf(machine=number, bits=bits // 32))
+    _check_file(str(file))
+    for other, words in ((243, "RISC-V"), (94, "Xtensa"), (8, "MIPS"), (20, "PowerPC"), (77, "ELF machine 77")):
+        file.write_bytes(elf(machine=other))
+        with pytest.raises(InputError) as e:
+            _check_file(str(file))
+        assert str(e.value) == (
+            f"--controller {file}: is built for {words}, 64 bits; this machine is {name}: build it here"
+        )
+    big = bytearray(elf())
+    big[5] = 2
+    big[16:20] = bytes([0, 3, 0, 243])
+    file.write_bytes(big)
+    with pytest.raises(InputError, match="is built for RISC-V, 64 bits"):
+        _check_file(str(file))
+    monkeypatch.setattr(program.platform, "machine", lambda: "other")  # nothing is known of it
+    file.write_bytes(elf(machine=77))
+    _check_file(str(file))
+
+
+def test_how_long_a_library_is_what_its_segments_need(tmp_path: Path) -> None:
+    def length(content: bytes) -> int:
+        (tmp_path / "c.so").write_bytes(content)
+        with (tmp_path / "c.so").open("rb") as f:
+            return _length(f)
+
+    assert length(elf()) == 200 and length(elf(bits=1)) == 0 and length(elf()[:63]) == 0
+    big = bytearray(elf())
+    big[5] = 2
+    assert length(bytes(big)) == 0
+    assert length(elf(number=4)) == 64 + 4 * 56 and length(elf(number=0)) == 0
+    small = bytearray(elf())
+    struct.pack_into("<H", small, 54, 55)  # segments too small to be some
+    assert length(bytes(small)) == 64 + 55
+    two = elf(number=2)[:64] + struct.pack("<8xQ16xQ16x", 300, 50) + struct.pack("<8xQ16xQ16x", 100, 40)
+    assert length(two) == 350
+
+
+def test_words_of_a_library_are_one_line() -> None:
+    assert program._line(b"a\n b\xff\t c") == "a b\ufffd c" and program._line(OSError(2, "x")) == "[Errno 2] x"
+    assert program._line("ab" * 400) == "ab" * 150 and program._text(None) == "" and program._text(b"\xff") == "\ufffd"
+    assert program._address(SimpleNamespace(), "vaneloop_observe") == 0
+
+
 # ---- files that are no library ---------------------------------------------------------------------------------------
 
 
@@ -247,6 +413,8 @@ def test_a_box_of_every_tick_keeps_them_all(watched: Path) -> None:
     box = black_box.left(watched)
     assert box is not None and box.tick == 2 and box.inputs[:, 0].tolist() == [0.0, 1.0, 2.0]
     file = next(f for f in watched.iterdir() if f.suffix != ".json")
+    assert file.stat().st_size == 8 * (64 + 30_000_000 * len(INPUTS))  # eight hours; it is sparse
+    assert np.fromfile(file, np.float64, len(INPUTS), offset=8 * (64 + len(INPUTS))).tolist() == [1.0] * len(INPUTS)
     os.truncate(file, 8)
     assert black_box.progress(watched) == black_box._OVERWRITTEN and black_box.left(watched) is None
 
@@ -370,6 +538,192 @@ def test_what_a_controller_leaves_behind_is_ended_but_not_what_is_ours(tmp_path:
     assert isolated(task) == (True, False, [])
     assert isolation._descendants() == [] or all(p > 1 for p in isolation._descendants())
     assert not isolation._is_ours(os.getpid()) and not isolation._is_ours(2**22 + 1)
+
+
+# ---- the process with the controller ---------------------------------------------------------------------------------
+
+
+def test_the_process_with_the_controller_is_one_of_its_own() -> None:
+    """Its session, its signals as at the start of a program, an end with its parent's, no core file, first to go."""
+
+    def task() -> dict[str, Any]:
+        death, folder = ctypes.c_int(), black_box._WATCHED[0][0]
+        ctypes.CDLL(None).prctl(2, ctypes.byref(death))  # PR_GET_PDEATHSIG
+        for _ in range(1000):
+            if (folder / "child").exists() and (folder / "child").read_text():
+                break
+            time.sleep(0.002)
+        return {
+            "session": os.getsid(0) == os.getpid(), "guard": os.getsid(os.getppid()) == os.getppid(),
+            "mask": signal.pthread_sigmask(signal.SIG_BLOCK, []), "death": death.value,
+            "rows": black_box._WATCHED[0][1],
+            "handlers": [signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGHUP)],
+            "interrupt": signal.getsignal(signal.SIGINT) is signal.default_int_handler,
+            "core": resource.getrlimit(resource.RLIMIT_CORE), "faults": faulthandler.is_enabled(),
+            "memory": Path("/proc/self/oom_score_adj").read_text().strip(),
+            "child": (folder / "child").read_text() == str(os.getpid()), "folder": str(folder),
+        }  # fmt: skip
+
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    handlers = [signal.getsignal(n) for n in isolation._ASKS]
+    found = isolated(task)
+    assert not os.path.exists(found.pop("folder"))
+    assert found == {
+        "session": True, "guard": True, "mask": mask, "death": signal.SIGKILL, "rows": 1,
+        "handlers": [signal.SIG_DFL, signal.SIG_DFL], "interrupt": True, "core": (0, 0), "faults": False,
+        "memory": "1000", "child": True,
+    }  # fmt: skip
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, []) == mask
+    assert [signal.getsignal(n) for n in isolation._ASKS] == handlers
+    assert isolated(lambda: black_box._WATCHED[0][1], save_crash="f") == black_box.EVERY_TICK
+
+
+def test_what_was_said_before_is_written_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A copy of the process would write what is still in its streams a second time."""
+
+    class Stream:
+        flushed = 0
+
+        def flush(self) -> None:
+            self.flushed += 1
+
+    out, error = Stream(), Stream()
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(sys, "stderr", error)
+    inside = isolated(lambda: (out.flushed, error.flushed))
+    monkeypatch.setattr(sys, "stderr", None)
+    isolation._flush()
+    assert inside == (1, 1) and (out.flushed, error.flushed) == (2, 1)
+
+
+def test_signals_go_on_to_the_controller_and_stops_are_waited_out() -> None:
+    def asks(number: int) -> int:
+        os.kill(os.getppid(), number)
+        time.sleep(20.0)
+        return 1
+
+    with pytest.raises(KeyboardInterrupt):
+        isolated(lambda: asks(signal.SIGINT))
+    with pytest.raises(
+        ControllerFailed, match=r"^the process with the controller ended by SIGTERM, outside a call of it$"
+    ):
+        isolated(lambda: asks(signal.SIGTERM))
+
+    def stops_its_guard() -> int:
+        os.kill(os.getppid(), signal.SIGSTOP)
+        return 7
+
+    assert isolated(stops_its_guard) == 7  # it is woken
+
+    def stops_for_a_while() -> int:
+        me = os.getpid()
+        if os.fork() == 0:
+            time.sleep(0.25)
+            os.kill(me, signal.SIGCONT)
+            os._exit(0)
+        os.kill(me, signal.SIGSTOP)
+        time.sleep(0.25)
+        return 8
+
+    assert isolated(stops_for_a_while) == 8
+    with pytest.raises(ControllerFailed, match=r"^the process with the controller was stopped for 0\.3 s$"):
+        isolated(lambda: os.kill(os.getpid(), signal.SIGSTOP), patience=0.3)
+
+
+def in_a_call(then: Any) -> Any:
+    """A task that is in tick 3 of a controller when it does ``then``."""
+
+    def task() -> Any:
+        head, _ = black_box.new("c.so", CAL)
+        head[ENTERED], head[RETURNED] = 4.0, 3.0
+        return then(head)
+
+    return task
+
+
+def test_a_call_that_does_not_come_back_is_ended_and_one_that_goes_on_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ControllerFailed) as e:
+        isolated(in_a_call(lambda head: time.sleep(20.0)), patience=0.3)
+    assert str(e.value).startswith(
+        "--controller c.so: did not come back within 0.3 s, in tick 3, 0.003 s after power-on; "
+    )
+
+    def goes_on(head: Any) -> int:
+        for _ in range(30):
+            time.sleep(0.05)
+            head[ENTERED] += 1.0
+            head[RETURNED] += 1.0
+        return 9
+
+    assert isolated(in_a_call(goes_on), patience=1.0) == 9
+
+    def does_not_hear(head: Any) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        os.kill(os.getppid(), signal.SIGTERM)
+        while True:
+            time.sleep(0.05)
+            head[ENTERED] += 1.0
+
+    monkeypatch.setattr(isolation, "_ENDING", 0.3)
+    with pytest.raises(ControllerFailed, match=r"^--controller c\.so: did not end within 0\.3 s of SIGTERM, in tick "):
+        isolated(in_a_call(does_not_hear))
+
+
+def test_who_closes_what_is_not_its_own_is_named() -> None:
+    def closes(*ends: int) -> Any:
+        def task() -> str:
+            black_box.new("c.so", CAL)
+            os.closerange(*ends)
+            return "good"
+
+        return task
+
+    for ends, said in (((0, 1), "standard input"), ((2, 3), "standard error"), ((3, 200), "a file descriptor")):
+        with pytest.raises(ControllerFailed, match=rf"^--controller c\.so: it closed {said}, which is not its own$"):
+            isolated(closes(*ends))
+    assert isolated(closes(200, 201)) == "good"
+    assert isolated(lambda: os.closerange(0, 1)) is None  # no controller: a task may
+
+
+def test_a_session_whose_guard_is_gone_is_ended(tmp_path: Path) -> None:
+    left = os.fork()
+    if left == 0:
+        os.setsid()
+        time.sleep(60.0)
+        os._exit(0)
+    while os.getsid(left) != left:
+        time.sleep(0.001)
+    (tmp_path / "child").write_text(str(left))
+    assert isolation._read_end(tmp_path) == _End()
+    assert os.waitstatus_to_exitcode(os.waitpid(left, 0)[1]) == -signal.SIGKILL
+    with pytest.raises(ControllerFailed) as e:
+        isolated(lambda: os.kill(os.getppid(), signal.SIGKILL))
+    assert str(e.value) == (
+        "the process with the controller ended what watches it, or took away its folder for temporary files"
+    )
+
+
+def test_every_process_below_is_found_and_ours_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = {
+        1: b"python\0-m\0hil.logs.recorder\0",
+        2: b"python\0/a/hil/bus/broker.py\0",
+        3: b"python\0hil/bus/broker.pyc\0",
+    }
+    for number, line in lines.items():
+        (tmp_path / str(number)).mkdir()
+        (tmp_path / str(number) / "cmdline").write_bytes(line)
+    monkeypatch.setattr(isolation, "Path", lambda text: tmp_path / text.removeprefix("/proc/"))
+    assert [isolation._is_ours(n) for n in (1, 2, 3, 4)] == [True, True, False, False]
+    # children, their children; a dead one counts where it is this process's own to clear away
+    stats = {10: "(a b) S 1", 11: "(x)) y) S 10", 12: "(z) Z 10", 13: "(z) Z 7", 14: "(q) R 9", 15: "(broken"}
+    for number, line in stats.items():
+        (tmp_path / str(number)).mkdir()
+        (tmp_path / str(number) / "stat").write_text(f"{number} {line} 0 0")
+    monkeypatch.setattr(isolation, "Path", lambda text: tmp_path)
+    monkeypatch.setattr(os, "waitid", lambda *given: None)
+    for me, below in ((1, [10, 11]), (7, [13]), (10, [11, 12]), (3, [])):
+        monkeypatch.setattr(os, "getpid", lambda me=me: me)
+        assert sorted(isolation._descendants()) == below
 
 
 # ---- crash logs ------------------------------------------------------------------------------------------------------
