@@ -124,6 +124,10 @@ def test_the_electromechanical_plant_of_a_table_is_its_numbers_in_si() -> None:
     }
     assert {k: getattr(p, k) for k in expected} == pytest.approx(expected, rel=1e-12)
     assert p.table == "plant_electromechanical.toml"
+    default = MotorServoPlant()  # what stands for the tables' where a test or a user gives some of it alone
+    for name in ("speed_gain", "speed_time", "current_bandwidth", "torque_constant", "viscous"):
+        assert getattr(default, name) == pytest.approx(expected[name])
+    assert default.inertia == pytest.approx(expected["inertia"], rel=0.15)
     # no oil: rated current gives the rated speed at any pressure
     assert p.speed_per_ampere == pytest.approx(expected["flow_gain"] / expected["rated_current"])
 
@@ -970,6 +974,10 @@ def test_a_recommendation_is_the_filter_of_its_model() -> None:
 def test_the_estimates_start_at_rest_on_the_first_sample() -> None:
     m = tf.TrendModel()
     d = tf.recommend(m)
+    leap = np.array([50.0, 51.0, 49.0, 49.5, 50.0])  # each of the first samples another
+    for got, expected in zip(tf.firmware_estimates(leap, d)[:2], tf.filterpy_estimates(m, leap), strict=True):
+        np.testing.assert_allclose(got, expected, atol=1e-10)
+    assert tf.firmware_estimates(leap, d)[0][0] == 50.0
     y = np.array([50.0, 50.0, 51.0, 51.0])
     n, rate = tf.filterpy_estimates(m, y)
     assert (n[0], rate[0]) == (50.0, 0.0)

@@ -22,7 +22,7 @@ from plant import build_plant, load_geometry, load_schedules
 from plant.effect import T_REF
 from plant.geometry import vane_angles
 from plant.linkage import G_HYSTERESIS, G_L, G_LDP, N_CRANK, N_PER_STAGE, stage_ring_angle, vane_angle
-from plant.spatial import Clearances
+from plant.spatial import Clearances, spatial_angles
 from vaneloop.base.errors import InputError
 from vaneloop.design import (
     clearance,
@@ -36,6 +36,7 @@ from vaneloop.design import (
 )
 from vaneloop.design import strategies as st
 from vaneloop.design.links import ScheduleOptions, geometry_with
+from vaneloop.design.multibody import multibody_angles
 
 GEOMETRY, SCHEDULES = load_geometry(), load_schedules()
 
@@ -110,7 +111,29 @@ def test_a_target_outside_the_stroke_is_named_where_it_is_furthest_off() -> None
     with pytest.raises(InputError, match=r"at 70 % speed: target angle \(=nan deg\)"):
         stroke_tables.refuse_outside(speed, np.array([1.0, 1.0, math.nan, 1.0]), 0.0, 5.0)
     assert stroke_tables.schedules_at_design(np.array([98.0, 99.5, 101.0])) == 1
+    ends = np.rad2deg(vane_angles(np.array([0.0, 48e-3]), GEOMETRY)[:, 0])  # of the stops
+    high = SCHEDULES.model_copy(
+        update={"vigv": SCHEDULES.vigv.model_copy(update={"values": [v + 30.0 for v in SCHEDULES.vigv.values]})}
+    )
+    for made in (stroke_tables.stroke_tables, stroke_tables.stroke_of_model):
+        with pytest.raises(InputError) as e:
+            made(GEOMETRY, high, np.array([90.0, 100.0]))
+        at = np.rad2deg(high.targets(np.array([100.0]))[0, 0])
+        assert str(e.value) == (
+            f"vigv: no stroke meets the schedule at 100 % speed: target angle (={at:.4g} deg) must be in "
+            f"[{ends[0]:.4g}, {ends[1]:.4g}], what 0 to 48 mm of stroke give"
+        )
     assert stroke_tables.schedules_at_design(np.array([98.0, 99.0, 100.5, 101.0])) == 2
+
+
+def test_the_tables_have_each_per_cent_from_where_the_schedule_rises_and_its_breakpoints() -> None:
+    def of(speed: list[float], angle: list[float]) -> list[float]:
+        axes = {"speed": speed, "vigv": angle, "vgv1": None, "vgv2": None}
+        update = {n: SCHEDULES.vigv.model_copy(update={"values": v}) if v else None for n, v in axes.items()}
+        return stroke_tables.table_speeds(SCHEDULES.model_copy(update=update)).tolist()
+
+    assert of([50.0, 96.5, 98.25, 100.4], [1.0, 1.0, 2.0, 3.0]) == [96.5, 97.0, 98.0, 98.25, 99.0, 100.0, 100.4]
+    assert of([97.0, 99.0], [1.0, 3.0]) == [97.0, 98.0, 99.0]
 
 
 def test_tables_are_written_ten_numbers_a_line(tmp_path: Path) -> None:
@@ -347,6 +370,22 @@ def test_the_play_that_tells_branches_apart_is_a_quarter_wider_than_the_gap() ->
     assert (found.low, found.high) == (x[found.branch != 0].min(), x[found.branch != 0].max())
     none = loop_fit.fit_with_width(t, x, 0.0 * r, s, v, 12.0, 0.03, (0.0, 0.02), "vigv", "log")
     assert (none.branch == loop_fit._branches(x, 0.12, 0.03)).all()  # no gap: four times the tolerance
+
+
+def test_a_branch_that_only_a_narrower_play_shows_is_found_and_a_wider_gap_refused() -> None:
+    """A short way back: 40 % of the travel hide it, 15 % do not. A gap that is wider than that is refused."""
+    t = np.arange(0.0, 24.0, 0.05)
+    x = np.where(t < 12.0, t, np.where(t < 15.0, 24.0 - t, t - 6.0))  # 12 mm up, 3 mm back, up again
+    ring, lost = x[0], []
+    for v in x:
+        ring = min(max(ring, v - 0.25), v + 0.25)
+        lost.append(ring - v)
+    s, v = np.full(t.size, 1.0), np.gradient(x, t)
+    assert loop_fit._missing(loop_fit._branches(x, 0.25 * 18.0, 0.02), x) == "retraction"
+    fit = loop_fit.fit_with_width(t, x, np.array(lost), s, v, 18.0, 0.02, (0.0, 1e-3), "vigv", "log")
+    assert np.mean(fit.gap) == pytest.approx(0.5, abs=0.03)
+    with pytest.raises(LogError, match=r"^log: vigv: the loop has one branch only, retraction is missing"):
+        loop_fit.fit_with_width(t, x, 7.0 * np.array(lost), s, v, 18.0, 0.02, (0.0, 1e-3), "vigv", "log")
 
 
 def test_a_log_that_goes_one_way_says_how_far_it_went() -> None:
@@ -804,6 +843,46 @@ def test_the_check_in_space_has_its_limits() -> None:
     assert replace(both, multibody={}).difference("vigv").tolist() == [2.0, 2.0]
 
 
+@pytest.mark.parametrize(("stage", "offset", "vane"), [("vigv", 0.0, 90.0), ("vgv2", 12.0, 90.0), ("vgv1", 0.0, -40.0)])
+def test_the_multibody_system_is_the_mechanism_in_space(stage: str, offset: float, vane: float) -> None:
+    pytest.importorskip("exudyn")
+    x = np.array([0.0, 20.0, 48.0])
+    got = multibody_angles(GEOMETRY, stage, x, offset, vane)
+    # the ring turns about its centre, so that every vane of it has the same angle
+    np.testing.assert_allclose(got, spatial_angles(GEOMETRY, stage, x, offset), atol=1e-7)
+
+
+def test_a_multibody_system_that_does_not_close_is_named_with_its_stroke() -> None:
+    pytest.importorskip("exudyn")
+    with pytest.raises(InputError, match=r"^vigv: the multibody system does not close at stroke \d+(\.\d+)? mm$"):
+        multibody_angles(GEOMETRY, "vigv", np.array([24.0, 400.0]))
+
+
+def test_a_check_in_space_closes_every_stage_by_each_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, done = [], []
+
+    def bodies(geometry: Any, stage: str, stroke: Any, offset: float) -> Any:
+        asked.append((stage, stroke.tolist(), offset))
+        return stroke + 1.0
+
+    monkeypatch.setattr(spatial, "multibody_angles", bodies)
+    monkeypatch.setattr(spatial, "is_there", lambda name: name == "exudyn")
+    check = spatial.spatial_check(GEOMETRY, 3.0, 2, done.append)
+    assert asked == [(stage, [0.0, 48.0], 3.0) for stage in GEOMETRY.vanes] and check.notes == []
+    assert done == pytest.approx([1 / 3, 2 / 3, 1.0]) and check.stroke.tolist() == [0.0, 48.0]
+    for k, stage in enumerate(GEOMETRY.vanes):
+        np.testing.assert_allclose(check.planar[stage], model(k)(check.stroke))
+        np.testing.assert_allclose(check.newton[stage], spatial_angles(GEOMETRY, stage, check.stroke, 3.0))
+        assert check.multibody[stage].tolist() == [1.0, 49.0]
+    monkeypatch.setattr(spatial, "is_there", lambda name: False)
+    alone = spatial.spatial_check(GEOMETRY, points=3, progress=done.append)
+    assert alone.multibody == {} and alone.stroke.tolist() == [0.0, 24.0, 48.0] and len(done) == 3
+    assert alone.notes == [
+        "exudyn is not installed (pip install 'vaneloop[multibody]'): constraint equations by Newton's method only"
+    ]
+    np.testing.assert_array_equal(alone.newton["vigv"], spatial_angles(GEOMETRY, "vigv", alone.stroke))
+
+
 # ---- strategies ------------------------------------------------------------------------------------------------------
 
 
@@ -961,6 +1040,15 @@ def test_the_best_is_judged_against_dual() -> None:
     assert by_name["all: VIGV maximum of x (deg), at most dual's"] == (0.4, 1.2, True)
     assert [(g["value"], g["held"]) for g in goals[-2:]] == [(0.21, False), (0.2, True)]
     assert goals[-1]["goal"] == "potentiometers, stuck, at rest: step (deg)" and len(goals) == 1 + 2 * 3 + 2
+    three = (rows[0], st.Scenario("more"), rows[1])
+    more = {("more", n): outcome("more", n, 0.3) for n in ("dual", "x")}
+    assert st.judged(three, {**runs, **more}, [], "x")[0]["goal"].startswith("all: mean VIGV error of dual over")
+    near = {
+        k: replace(o, figures={"vigv": {**o.figures["vigv"], "mean_abs_99_100": m}})
+        for (k, o), m in zip(runs.items(), (0.2, 0.3, 0.4, 0.5), strict=True)
+    }
+    goal = "nominal: VIGV mean at 99 to 100 % of x (deg), at most dual's"
+    assert st.judged(rows[:1], near, [], "x")[-1] == {"goal": goal, "value": 0.3, "limit": 0.2, "held": False}
     better = {**runs, ("all", "x"): outcome("all", "x", 0.19)}
     assert st.judged(rows, better, [], "x")[0]["held"] is True
     d = runs["all", "x"].to_dict()
