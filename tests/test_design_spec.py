@@ -451,6 +451,12 @@ def test_a_steady_cycle_is_the_sine_that_it_is() -> None:
     wiggle = sine + 0.002 * np.sin(2 * math.pi * 171.0 * t)
     seen = steady_cycle(t, wiggle, 0.01)
     assert seen is not None and seen.omega == pytest.approx(w, rel=5e-3)
+    # about the middle of its ends, also where it stays longer above
+    long_up = np.maximum(np.sin(2 * math.pi * 5.0 * t), -0.5)
+    seen = steady_cycle(t, np.where(np.sin(2 * math.pi * 5.0 * t) > -0.8, 1.0, -1.0) + 0.1 * long_up, 0.01)
+    assert seen is not None and seen.omega == pytest.approx(2 * math.pi * 5.0, rel=1e-6)
+    # a crossing without a swing below before it is none: here it is the first of three
+    assert steady_cycle(t, np.where(t < 2.0, 0.0, np.sin(2 * math.pi * 1.3 * (t - 2.0) - 0.2)), 0.01) is None
     # two crossings are no oscillation yet, three are
     assert steady_cycle(t, np.where(t < 2.0, 0.0, np.sin(2 * math.pi * (t - 2.3))), 0.01) is None
     assert steady_cycle(t, np.where(t < 2.0, 0.0, np.sin(2 * math.pi * 1.6 * (t - 2.0) - 1.6)), 0.01) is not None
@@ -727,6 +733,10 @@ def test_the_figures_of_play_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     (ref, _), how = known.asked[0]
     assert how == {"outside": 1.5e-3} and ref.size == 2000
+    early = still(vane=lambda ref: np.where(np.arange(ref.size) < ref.size // 2, 1.0, 0.0))
+    monkeypatch.setattr(servo_design, "simulate", Known(early))
+    p = servo_design._play_figures(GAINS, ServoPlant(), Play("vanes", 1.5e-3), predicted(), {}, seconds=2.0)
+    assert p.simulated_lvdt_mm == 0.0  # of the second half
     assert (ref[100], ref[309], ref[-1]) == pytest.approx((24e-3, 28e-3, 26e-3), abs=1e-9)
 
 
@@ -913,6 +923,8 @@ def test_a_trend_model_needs_numbers_above_zero(name: str) -> None:
 
 
 def test_the_trends_model_is_its_equations() -> None:
+    usual = tf.TrendModel()
+    assert (usual.acceleration, usual.noise, usual.resolution, usual.step) == (0.3, 0.02, 0.002, 0.01)
     m = tf.TrendModel(acceleration=2.0, noise=0.03, resolution=0.06, step=0.1)
     assert m.sigma == pytest.approx(math.sqrt(0.03**2 + 0.06**2 / 12))
     f, h, q, r = m.matrices()
@@ -1012,6 +1024,10 @@ def test_one_sample_alone_neither_sets_the_turn_nor_turns() -> None:
     assert (tf.direction(y, SLOW) == 1.0).all()
     y = np.r_[np.full(20, 60.0), np.full(2, 64.0), np.full(40, 60.0)]  # two in a row count
     assert (tf.direction(y, SLOW) == -1.0).sum() == 31
+    falls = np.r_[[60.0], np.full(40, 59.4)]  # the first sample is the farthest demand, alone as it is
+    assert (tf.direction(falls, SLOW) == -1.0).argmax() == 10
+    rises = np.r_[[60.0, 63.0], np.full(40, 60.0)]
+    assert (tf.direction(rises, SLOW) == 1.0).all()
     y = np.r_[np.full(20, 60.0), np.full(9, 59.0), [60.0], np.full(9, 59.0), np.full(5, 60.0)]
     assert (tf.direction(y, SLOW) == 1.0).all()  # a gap, and the hold begins anew
     # and back again, from the lowest that two in a row reached
