@@ -14,6 +14,7 @@ import signal
 import struct
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,7 +24,8 @@ import numpy as np
 import pytest
 
 from controller import INPUTS, OUTPUTS, load_calibration, new_inputs, new_outputs, new_state
-from controller.records import STATE
+from controller.header import VERSION
+from controller.records import INPUT_FIELDS, STATE
 from hil.native import black_box, crash_log, isolation, program
 from hil.native.call import (
     CALL,
@@ -41,7 +43,7 @@ from hil.native.call import (
 )
 from hil.native.isolation import ControllerFailed, _End, isolated
 from hil.native.program import _VIEWS, Program, _check_file, _length, observables, own_scalars, readable, restore, save
-from tests.native_builds import wrong
+from tests.native_builds import build, wrong
 from vaneloop.base.errors import InputError
 
 CAL = load_calibration()
@@ -304,6 +306,27 @@ def test_how_long_a_library_is_what_its_segments_need(tmp_path: Path) -> None:
     assert length(two) == 350
 
 
+def test_a_library_of_another_interface_or_without_a_function_is_refused(gcc: str, tmp_path: Path) -> None:
+    other = wrong(gcc, tmp_path, version="4294967295u")
+    with pytest.raises(InputError) as e:
+        Program(other).start(CAL)
+    assert str(e.value) == (
+        f"--controller {other}: is compiled for interface 4294967295; this VaneLoop has interface {VERSION}: compile "
+        "it again with the header that ships"
+    )
+    (tmp_path / "none.c").write_text("int vaneloop_version(void) { return 1; }")
+    none = build(gcc, tmp_path / "none.c", tmp_path / "none.so")
+    with pytest.raises(InputError) as e:
+        Program(none).start(CAL)
+    assert str(e.value) == (
+        f"--controller {none}: vaneloop_init is missing; vaneloop_version, vaneloop_init, vaneloop_step are needed"
+    )
+    refuses = wrong(gcc, tmp_path, init='if (c->points > 0) return "too\\n many";')
+    with pytest.raises(InputError) as e:
+        Program(refuses).start(CAL)
+    assert str(e.value) == f"--controller {refuses} refuses the calibration: too many"
+
+
 def test_words_of_a_library_are_one_line() -> None:
     assert program._line(b"a\n b\xff\t c") == "a b\ufffd c" and program._line(OSError(2, "x")) == "[Errno 2] x"
     assert program._line("ab" * 400) == "ab" * 150 and program._text(None) == "" and program._text(b"\xff") == "\ufffd"
@@ -431,6 +454,11 @@ def box_of(**more: Any) -> black_box.Box:
 
 
 def test_what_a_controller_did_is_one_line() -> None:
+    every, at = isolation._words(np.arange(float(len(INPUTS)))).split(", "), 0
+    for field, words in zip(INPUT_FIELDS, every, strict=True):
+        numbers = range(at, at := at + (len(field.each) or 1))
+        unit = "" if field.unit == "-" else f" {field.unit}"
+        assert words == f"{field.name} {' '.join(map(str, numbers))}{unit}"
     inputs = np.full((1, len(INPUTS)), np.nan)
     inputs[0, INPUTS.index("n_dem")] = 70.5
     words = isolation._words(inputs[0])
@@ -667,6 +695,56 @@ def test_a_call_that_does_not_come_back_is_ended_and_one_that_goes_on_is_not(mon
     monkeypatch.setattr(isolation, "_ENDING", 0.3)
     with pytest.raises(ControllerFailed, match=r"^--controller c\.so: did not end within 0\.3 s of SIGTERM, in tick "):
         isolated(in_a_call(does_not_hear))
+
+
+def test_a_task_may_be_isolated_from_any_thread() -> None:
+    came: list[int] = []
+    thread = threading.Thread(target=lambda: came.append(isolated(lambda: 6)))
+    thread.start()
+    thread.join(60.0)
+    assert came == [6]
+
+
+def test_what_hears_of_no_end_of_its_session_is_ended_all_the_same() -> None:
+    """A process whose parent has ended is the guard's: its next parent."""
+
+    def task() -> int:
+        read, write = os.pipe()
+        if os.fork() == 0:
+            if os.fork() == 0:
+                os.setsid()
+                os.write(write, str(os.getpid()).encode())
+                time.sleep(60.0)
+            os._exit(0)
+        return int(os.read(read, 20))
+
+    left = isolated(task)
+    with pytest.raises(ProcessLookupError):
+        os.kill(left, 0)
+
+
+def test_exit_waits_for_nothing_that_was_registered_before() -> None:
+    libc = ctypes.CDLL(None)
+    child = os.fork()
+    if child == 0:
+        late = ctypes.CFUNCTYPE(None, ctypes.c_int, ctypes.c_void_p)(lambda code, _: os._exit(9))
+        libc.on_exit(late, None)
+        isolation._end_at_once()
+        libc.exit(4)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 4
+
+
+def test_a_copy_of_the_process_cannot_write_into_its_box(watched: Path) -> None:
+    black_box.watched(watched, every_tick=False)
+    head, rows = black_box.new("c.so", CAL)
+    head[ENTERED] = 1.0
+    child = os.fork()
+    if child == 0:
+        faulthandler.disable()
+        head[ENTERED] = 2.0
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGSEGV
+    assert head[ENTERED] == 1.0 and rows.shape == (1, len(INPUTS))
 
 
 def test_who_closes_what_is_not_its_own_is_named() -> None:

@@ -356,7 +356,6 @@ def restore(foreign: Foreign, state: bytes | None) -> None:
     running = _KEPT[foreign.at_fed]
     library = running.library
     library.vaneloop_restore.argtypes = [ctypes.c_void_p]
-    library.vaneloop_restore.restype = None
     with calling(running.head, "vaneloop_restore"):
         library.vaneloop_restore(state)
 

@@ -106,33 +106,33 @@ CORE = (
 OWN_MODELS = ("vaneloop.identification.user_models", "vaneloop.identification.unmodelled")
 # Of each package the files of tests that are nearest to it, where its code runs as it does for a user: compiled.
 NEAREST = {
-    "controller": "records_spec controller xcp tables c_reference node",
+    "controller": "records_spec controller channels two_actuators xcp tables c_reference node",
     "plant": (
         "plant_spec plant effects effects_reference linkage electromechanical machines tables tolerances lanes "
-        "curve_lanes spatial fmu"
+        "curve_lanes spatial fmu two_actuators"
     ),
     "plant.stages": "stages_spec curve_lanes same_answer lanes effects machines electromechanical loggers",
     **dict.fromkeys(
         ("hil", "hil.replay"), "hil_spec replay held figures page reading lockstep strategies schedule campaign"
     ),
-    "hil.bus": "bus_spec bus_port_spec bus_lockstep_spec bus frames wire loop moments realtime node uds",
+    "hil.bus": "bus_spec bus_port_spec bus_lockstep_spec bus frames wire loop moments realtime node uds secoc",
     "hil.logs": (
         "logs logs_frames_spec logs_names_spec logs_record_spec logs_tables_spec loggers reading readings guess held "
-        "record logs_fuzz"
+        "record logs_fuzz formulas field_traces tables_of_the_field transport log_formats recorders dataframes child"
     ),
     "hil.native": "native_spec native c_reference xcp",
     "hil.loop": (
         "loop_spec loop lanes lockstep node secoc realtime moments replay native machines frames strategies "
-        "scenarios_in_lanes gpu"
+        "scenarios_in_lanes gpu channels two_actuators"
     ),
     "hil.fmu": "fmu_spec fmu",
-    "hil.calibrate": "xcp uds xcp_spec",
-    "hil.uds": "uds uds_spec",
-    "hil.inject": "inject fuzz campaign loop moments inject_spec fuzz_spec",
+    "hil.calibrate": "xcp uds xcp_spec tool_states",
+    "hil.uds": "uds uds_spec tool_states",
+    "hil.inject": "inject fuzz campaign loop moments inject_spec fuzz_spec scenarios_in_lanes tool_states native",
     "vaneloop": "verbs",
     "vaneloop.base": (
         "base_spec files streams lean tables kept parts held machines identification learn_surfaces learn_turns "
-        "learn_stops exit_codes your_own_model verbs help curve_lanes"
+        "learn_stops exit_codes your_own_model verbs help curve_lanes cells child sizes plant_spec"
     ),
     **dict.fromkeys(
         CORE,
@@ -155,17 +155,20 @@ NEAREST = {
     "vaneloop.identification.vane_chain": (
         "vane_chain_spec recorders hum stationary_noise late_channels same_answer learn_vanes learn_lags learn_stops "
         "learn_followers learn_faint learn_screening held loggers long_logs identification curves directions "
-        "electromechanical readings"
+        "electromechanical readings two_actuators onset"
     ),
     "vaneloop.design": "design_spec schedule_spec design schedule spatial strategies tables tolerances",
-    "vaneloop.fleet": "fleet_folder fleet_trends fleet_workers campaign_numbers fleet_report fleet_run campaign",
+    "vaneloop.fleet": (
+        "fleet_folder fleet_trends fleet_workers campaign_numbers fleet_report fleet_run campaign fleet_damage "
+        "probability cells"
+    ),
     "vaneloop.pages": (
         "page_parts page_outlines page design campaign fleet_report schedule strategies spatial verbs search_commands "
         "learn_turns"
     ),
     "vaneloop.verbs": (
         "verbs_spec verbs parts held long_logs guess starts spikes doubts machines learn_two own_laws your_own_model "
-        "search_commands trust latest"
+        "search_commands trust latest late_channels dataframes steady_points"
     ),
     "vaneloop.cli": (
         "cli_spec cli_commands_spec experiment_own help exit_codes completion verbs search_commands "
