@@ -372,6 +372,48 @@ def test_a_trial_s_file_says_what_is_to_be_done(tmp_path: Path, monkeypatch: pyt
     assert trial.run_trial(str(tmp_path / "t.json"), options, "/run")["answer"]["of"] == [files, g, TWO, asked, 7]
 
 
+def test_samples_of_one_group_run_in_lanes_together_and_their_answers_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[Any] = []
+    margin = trial.Margin("e", True, 2.0, "mm", 0.5)
+
+    def lanes(files: Any, g: Group, quantities: Any, points: Any) -> list[Any]:
+        ran.append((g.name, [list(p) for p in points]))
+        return [[margin] if p[0] < 0.5 else trial.Alone("why") for p in points]
+
+    monkeypatch.setattr(trial, "in_lanes", lanes)
+    monkeypatch.setattr(trial, "trial_once", lambda files, g, q, point: {"held": False, "point": point})
+    monkeypatch.setattr(trial, "_kept", {})
+    asked = {
+        "a": {"group": ["s", "c", "f"], "point": [0.1, 0.1]}, "b": {"group": ["s", "c", "f"], "point": [0.2, 0.1]},
+        "c": {"group": ["s", "c", "f"], "point": [0.9, 0.1]}, "other": {"group": ["s", "c", "g"], "point": [0.3, 0.1]},
+        "search": {"group": ["s", "c", "f"], "search": 3}, "levels": {"group": ["s", "c", "f"], "subset": True},
+        "bad": {"group": ["s", "c", "f"], "point": [0.3], "what": 1},
+    }  # fmt: skip
+    for name, one in asked.items():
+        whole_json(tmp_path / f"{name}.json", one)
+    options = {"files": {}, "vary": [asdict(q) for q in TWO], "seed": 7}
+    at = {name: str(tmp_path / f"{name}.json") for name in (*asked, "none")}
+
+    def answer(name: str, *beside: str) -> dict[str, Any]:
+        return dict(trial.run_trial(at[name], options, "/run", [at[n] for n in beside])["answer"])
+
+    in_lanes = {"held": True, "margins": [{"expected": "e", "held": True, "value": 2.0, "unit": "mm", "share": 0.5}],
+                "state_hash": None, "seen": [], "alone": ""}  # fmt: skip
+    assert answer("a", *at) == {"point": [0.1, 0.1], **in_lanes}
+    assert ran == [("s.c.f", [[0.1, 0.1], [0.2, 0.1], [0.9, 0.1]])]
+    assert answer("b") == {"point": [0.2, 0.1], **in_lanes} and len(ran) == 1  # kept, and asked for once
+    assert answer("c") == {"point": [0.9, 0.1], "held": False, "alone": "why"} and trial._kept == {}
+    assert answer("b")["alone"] == "" and ran[1] == ("s.c.f", [[0.2, 0.1]])
+    with pytest.raises(InputError, match=r"bad.json: is no trial of a campaign \(what: Extra inputs"):
+        trial.run_trial(at["bad"], options, "/run")
+    # the order in which a file names things does not matter
+    answer("a", "b")
+    whole_json(tmp_path / "b.json", {"point": [0.2, 0.1], "group": ["s", "c", "f"]})
+    assert answer("b")["alone"] == "" and len(ran) == 3
+
+
 def test_warming_up_compiles_the_loop_and_runs_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[Any] = []
     monkeypatch.setattr(trial, "warm_up", lambda told: seen.append(told("x")))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import struct
+from base64 import b64decode
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,14 +21,20 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.spans import Span
 from vaneloop.identification import Record, StageError, System
 from vaneloop.identification.chunked_residuals import Failing, Sums
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
 from vaneloop.identification.onset import Onset
 from vaneloop.identification.settings import PIECE_BLOCKS
 from vaneloop.identification.subsystem import Effect, Parameter, Stage
 from vaneloop.identification.unmodelled.fitted_candidate import Outcome
+from vaneloop.verbs import answer as answer_verb
 from vaneloop.verbs import learn, long, parts, search
 from vaneloop.verbs import replay as replay_verb
+from vaneloop.verbs.answer import Answer
+from vaneloop.verbs.curves import Curves, curves_of_logs, curves_of_stages
+from vaneloop.verbs.estimates import COLUMNS, Fitted, NoParameter, correlation_of, parameters_of
 from vaneloop.verbs.long import Held, Whole
 from vaneloop.verbs.machine import TABLES, Machine, files_of, with_law_files
+from vaneloop.verbs.replay import brief
 
 # ---- parts of logs ---------------------------------------------------------------------------------------------------
 
@@ -1316,3 +1324,232 @@ def test_effects_are_left_out_of_every_stage(monkeypatch: pytest.MonkeyPatch) ->
     assert search.not_given(chain, ["valve_lag"]).stages == ("stages", ["valve_lag"])  # type: ignore[comparison-overlap]
     with pytest.raises(InputError, match="--without 'valve_leg' is not in the library"):
         search.not_given(chain, ["valve_leg"])
+
+
+# ---- what every answer can do ----------------------------------------------------------------------------------------
+
+
+class Asked(Answer):
+    """An answer of known parts."""
+
+    def __init__(self, fits: Sequence[Fitted] = (), rows: Sequence[Any] = (), said: str = "a < b"):
+        self.log, self._of, self._rows, self._said = "folder/run.csv", fits, rows, said
+
+    def sentence(self) -> str:
+        return self._said
+
+    def rows(self) -> Sequence[Any]:
+        return self._rows
+
+    def page(self, command: str = "") -> Any:
+        return SimpleNamespace(
+            html=lambda: '<b>"x"</b>', title="T & U", verdict="so it is",
+            figures=[{"data": []}, {"data": [{"y": [1]}]}], write=lambda path: (Path(path), command),
+        )  # fmt: skip
+
+    def _fits(self) -> Sequence[Fitted]:
+        return self._of
+
+
+def line_stage(name: str, noise: float, outputs: tuple[str, ...] = ("y",)) -> Stage:
+    """A line of known noise, y = a + b x, measured at forty places."""
+    x = np.linspace(-1.0, 1.0, 40)
+    of = np.random.default_rng(1).standard_normal((len(outputs), 40)) * noise
+    return Stage(
+        name=name, outputs=outputs, units=("mm",) * len(outputs), t=0.5 * np.arange(40), window=None,
+        parameters=(Parameter("a", 2.0, "mm", tolerance=1.0), Parameter("b", 3.0, "mm", tolerance=0.05)),
+        effects=(Effect("bend", (Parameter("size", 0.0, "mm", -9.0, 9.0),), ((1.0,),)),),
+        run=lambda th: np.repeat(
+            (th[:, :1] + th[:, 1:2] * x + th[:, 2:3] * x**2)[:, None, :], len(outputs), axis=1
+        ),
+        measured=2.2 + 3.4 * x + 0.5 * x**2 + of, floor=np.full(len(outputs), noise),
+    )  # fmt: skip
+
+
+def fitted_line(name: str, outputs: tuple[str, ...] = ("y",), base: Any = None, start: float = 0.0) -> Fitted:
+    judge = LeastSquaresProblem(line_stage(name, 0.1, outputs), np.full(len(outputs), 0.1))
+    return Fitted(judge, judge.fit(("bend",), judge.stage.neutral()), base, start)
+
+
+def test_parameters_have_their_errors_intervals_and_bounds() -> None:
+    f = fitted_line("stem")
+    p = parameters_of([f])
+    assert list(p) == ["a", "b", "bend.size"] and len(p) == 3 and "a" in p and "size" not in p
+    a, b, size = p.values()
+    assert (a.stage, a.effect, a.name, a.unit, a.bound, a.at_bound) == ("stem", "", "a", "mm", (1.0, 3.0), False)
+    assert a.low < a.value < a.high and a.stderr == pytest.approx(
+        0.5 * (f.fit.high[0] - f.fit.low[0]) / 1.6449, rel=1e-3
+    )
+    assert (b.at_bound, b.value, b.bound) == (True, 3.05, (2.95, 3.05)) and math.isnan(b.stderr)
+    assert (size.effect, size.bound) == ("bend", (-9.0, 9.0)) and size.value == pytest.approx(0.5, abs=0.2)
+    with pytest.raises(
+        NoParameter,
+        match=r"^parameter 'bend.siz' was not fitted \(did you mean bend.size\?\); fitted: a, b, bend.size$",
+    ):
+        p["bend.siz"]
+    frame = p.to_frame()
+    assert list(frame.columns) == list(COLUMNS) and frame.index.name == "parameter"
+    assert frame.loc["bend.size", ["subsystem", "effect", "lower_bound", "upper_bound", "at_bound"]].tolist() == [
+        "stem", "bend", -9.0, 9.0, False,
+    ]  # fmt: skip
+    assert repr(p).splitlines()[0].split() == ["parameter", *COLUMNS] and len(repr(p).splitlines()) == 4
+    assert p._repr_html_().count("<tr>") == 4 and repr(parameters_of([])) == "Parameters(nothing was fitted)"
+    two = parameters_of([f, fitted_line("ring")])
+    assert list(two) == [f"{s}: {n}" for s in ("stem", "ring") for n in ("a", "b", "bend.size")]
+
+
+def test_errors_of_parameters_go_together_within_a_fit() -> None:
+    f, g = fitted_line("stem"), fitted_line("ring")
+    c = correlation_of([f, g])
+    own = f.judge.correlation(f.fit)
+    assert len(c) == 6 and "ring: a" in c and "a" not in c and list(c)[0] == "stem: a"
+    frame = c.to_frame()
+    np.testing.assert_array_equal(frame.to_numpy()[:3, :3], own)
+    np.testing.assert_array_equal(frame.to_numpy()[3:, 3:], own)
+    assert np.isnan(frame.to_numpy()[:3, 3:]).all() and frame.index.equals(frame.columns)
+    row = c["stem: a"]
+    assert row["stem: bend.size"] == own[0, 2] < -0.5 and math.isnan(row["ring: a"])
+    with pytest.raises(NoParameter, match=r"^parameter 'b' was not fitted"):
+        c["b"]
+    assert repr(c).splitlines()[1].split()[:2] == ["stem:", "a"] and f"{own[0, 2]:.3g}" in repr(c)
+    assert repr(correlation_of([])) == "Correlation(nothing was fitted)"
+
+
+def test_curves_are_what_was_measured_and_what_is_left() -> None:
+    f = fitted_line("stem", ("y", "z"), start=7.0)
+    f.judge.stage.measured[1, 3] = np.nan
+    judge = LeastSquaresProblem(f.judge.stage, np.array([0.1, 0.2]))
+    f = f._replace(judge=judge, fit=judge.fit(("bend",), judge.stage.neutral()))
+    curves = curves_of_stages([f], "run.csv")
+    assert list(curves.by_name) == ["y", "z"]
+    y, z = curves.by_name.values()
+    model, nominal = judge.stage.run(np.array([f.fit.theta, recalibrate(judge).theta]))
+    np.testing.assert_allclose(y.residual, judge.stage.measured[0] - model[0], atol=1e-9)
+    np.testing.assert_allclose(y.before, judge.stage.measured[0] - nominal[0], atol=1e-9)
+    np.testing.assert_allclose(y.t, 7.0 + judge.stage.t)
+    assert (y.of, y.unit, y.floor, z.floor) == ("stem", "mm", 0.1, 0.2) and np.isnan(z.residual[3])
+    assert y.ratio() == pytest.approx(np.sqrt(np.mean(y.before**2)) / 0.1)
+    assert z._replace(floor=0.0).ratio() == 0.0 and z._replace(before=np.full(40, np.nan)).ratio() == 0.0
+    assert z.ratio() == pytest.approx(np.sqrt(np.nanmean(z.before**2)) / 0.2)
+    assert curves.worst() == "y" and Curves([], "x").worst() == ""
+    left, said = curves.residuals, curves.fitted
+    assert (left.path, len(left["y"]), len(left["z"]), left["z"].unit) == ("run.csv", 40, 39, "mm")
+    np.testing.assert_allclose(said["y"].values, model[0], atol=1e-9)
+    np.testing.assert_allclose(left["z"].values, np.delete(z.residual, 3))
+    with_base = curves_of_stages([f._replace(base=SimpleNamespace(theta=np.array([2.0, 3.0, 0.0])))], "x")
+    np.testing.assert_allclose(
+        with_base.by_name["y"].before, judge.stage.measured[0] - 2.0 - 3.0 * np.linspace(-1, 1, 40)
+    )
+    both = curves_of_stages([f, fitted_line("ring")], "x")
+    assert list(both.by_name) == ["stem: y", "z", "ring: y"]
+
+
+def test_curves_of_logs_are_those_that_were_fitted_and_those_that_test() -> None:
+    def bound(names: list[str], many: int) -> Any:
+        at = {n: slice(k * 3, k * 3 + 3) for k, n in enumerate(names)}
+        measured = np.arange(float(2 * 3 * many)).reshape(2, -1)
+        return SimpleNamespace(
+            logs=at, measured=measured, data=SimpleNamespace(times=[np.arange(3.0) + k for k in range(many)]),
+            system=SimpleNamespace(outputs={"y": "V", "z": "A"}), floor=np.array([0.5, 0.25]),
+        )  # fmt: skip
+
+    errors = {n: np.full((2, 3), k + 1.0) for k, n in enumerate(("a", "b", "t"))}
+    logs: Any = SimpleNamespace(
+        fitted=bound(["a", "b"], 2), test=bound(["t"], 1),
+        errors=lambda theta: {n: e * theta for n, e in errors.items()},
+    )  # fmt: skip
+    curves = curves_of_logs(logs, 2.0, 3.0, "p")  # type: ignore[arg-type]
+    assert list(curves.by_name) == [f"{n}: {s}" for n in "abt" for s in "yz"]
+    c = curves.by_name["b: z"]
+    assert (c.of, c.unit, c.floor, c.t.tolist(), c.measured.tolist()) == ("b", "A", 0.25, [1, 2, 3], [9, 10, 11])
+    assert c.residual.tolist() == [-4.0] * 3 and c.before.tolist() == [-6.0] * 3
+    assert curves.by_name["t: y"].floor == 0.5  # of the logs that were fitted
+    logs.test = None
+    assert len(curves_of_logs(logs, 2.0, 3.0, "p").by_name) == 4  # type: ignore[arg-type]
+
+
+def test_an_answer_says_itself_in_a_console_a_cell_a_file_and_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [{"signal": f"s{k}", "verdict": "none", "rms": 0.5 * k} for k in range(13)]
+    a = Asked(rows=rows)
+    assert str(a) == "a < b" and repr(a) == "<Asked of run.csv: a < b>"
+    a.log = ""
+    assert repr(a) == "<Asked of a log: a < b>"
+    assert a.report("x.html", "why") == (Path("x.html"), "why")  # type: ignore[comparison-overlap]
+    frame = a.to_frame()
+    assert list(frame.columns) == ["signal", "verdict", "rms"] and frame["rms"].tolist() == [0.5 * k for k in range(13)]
+    shown = a.show()
+    assert repr(shown) == "T & U: so it is"
+    assert shown._repr_html_() == (
+        '<iframe srcdoc="&lt;b&gt;&quot;x&quot;&lt;/b&gt;" width="100%" height="600" title="T &amp; U"></iframe>'
+    )
+    monkeypatch.setattr(answer_verb, "is_there", lambda name: False)
+    cell = a._repr_html_()
+    assert cell.startswith("<p><strong>a &lt; b</strong></p>\n<table>") and cell.count("<tr>") == 13
+    assert "<p>and 1 rows more: <code>answer.to_frame()</code></p>" in cell and "<img" not in cell
+    assert f">{answer_verb.verdict_word('none')}<" in cell and ">none<" not in cell
+    a._rows = rows[:12]
+    assert "rows more" not in a._repr_html_()
+    a._rows = []
+    assert "<table>" not in a._repr_html_()
+    with pytest.raises(NotImplementedError):
+        Answer().rows()
+    monkeypatch.setattr(answer_verb, "painted", lambda figure: figure)
+    assert a.figure().data == () and a.figure(1).data[0].y == (1,)
+    a.page = lambda command="": SimpleNamespace(figures=[])  # type: ignore[method-assign]
+    assert a.figure(3).data == ()
+
+
+def test_an_answer_is_drawn_as_measured_and_as_the_model_has_it() -> None:
+    figure = pytest.importorskip("matplotlib.figure")
+    f = fitted_line("stem", ("y", "z"))
+    a = Asked([f])
+    ax = figure.Figure().subplots()
+    assert a.plot(ax) is ax and a.params is a.params and list(a.correl) == list(a.params)
+    c = a._curves.by_name[a._curves.worst()]
+    lines = {line.get_label(): line for line in ax.get_lines()}
+    assert list(lines) == ["measured", "nominal model", "with what was found"]
+    for label, values in (
+        ("measured", c.measured),
+        ("nominal model", c.measured - c.before),
+        ("with what was found", c.measured - c.residual),
+    ):
+        np.testing.assert_array_equal(lines[label].get_ydata(), values)
+        np.testing.assert_array_equal(lines[label].get_xdata(), c.t)
+    assert (ax.get_xlabel(), ax.get_ylabel(), ax.margins()[0]) == ("t [s]", f"{c.name} [mm]", 0.0)
+    assert ax.get_legend() is not None and ax.get_xgridlines()[0].get_visible()
+    assert [lines[n].get_linewidth() for n in lines] == [2.0, 0.8, 0.8]
+    left = figure.Figure().subplots()
+    a.plot(left, signal="z", residuals=True)
+    assert [line.get_label() for line in left.get_lines()] == ["nominal model", "with what was found"]
+    np.testing.assert_array_equal(left.get_lines()[1].get_ydata(), a._curves.by_name["z"].residual)
+    assert left.get_ylabel() == "residual of z [mm]"
+    same = Asked([f._replace(base=f.fit)])
+    alone = figure.Figure().subplots()
+    same.plot(alone, residuals=True)
+    assert [line.get_label() for line in alone.get_lines()] == ["model"] and alone.get_legend() is None
+    with pytest.raises(InputError, match=r"^plot: signal \(='zz'\) \(did you mean z\?\): allowed: y, z$"):
+        a.plot(ax, signal="zz")
+    with pytest.raises(InputError, match=r"allowed: nothing, as nothing was fitted$"):
+        Asked().plot(ax)
+    image = a._picture()
+    assert image.startswith('<img alt="a &lt; b" src="data:image/png;base64,iVBOR') and Asked()._picture() == ""
+    png = b64decode(image.split("base64,")[1].rstrip('">'))
+    assert struct.unpack(">II", png[16:24]) == (720, 300)
+    np.testing.assert_array_equal(a.residuals["y"].values, a._curves.by_name["y"].residual)
+    np.testing.assert_array_equal(a.fitted["z"].values, a._curves.fitted["z"].values)
+
+
+def test_what_an_answer_takes_as_a_log() -> None:
+    assert brief("x" * 58) == repr("x" * 58) and len(brief("x" * 58)) == 60
+    assert brief("x" * 59) == repr("x" * 59)[:57] + "..." and brief([1, 2]) == "[1, 2]"
+    assert replay_verb.a_log("a.csv") == "a.csv" and replay_verb.a_log(Path("a.csv")) == Path("a.csv")
+    with pytest.raises(
+        InputError, match=r"^log \(=7\): allowed: what read_log gives, a pandas.DataFrame, or a file's name$"
+    ):
+        replay_verb.a_log(7)
+    log = Log("a.csv", {"n_dem": Channel(T, 60.0 + T), "mine": Channel(T, T)}, [], {"mine": "mm"})
+    assert list(replay_verb.log_of(log, Machine())) == ["n_dem"]
+    ours = log[["n_dem"]]
+    assert replay_verb.log_of(ours, Machine()) is ours
+    with pytest.raises(LogError, match=r"^a.csv: no x_lvdt; it has n_dem, mine$"):
+        replay_verb.log_of(log, Machine(), require=("n_dem", "x_lvdt"))

@@ -160,7 +160,7 @@ class Answer:
         import plotly.graph_objects as go
 
         figures = self.page().figures
-        return go.Figure(painted(figures[which]) if figures else {})
+        return go.Figure(painted(figures[which]) if figures else None)
 
     def plot(self, ax: Axes | None = None, *, signal: str = "", residuals: bool = False) -> Axes:
         """Draw what was measured and what the model says of it.
