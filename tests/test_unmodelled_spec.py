@@ -5,7 +5,7 @@ the step that ranks them, what confirms them, and the Python file that says one.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from vaneloop import InputError, Record, System, unknown
+from vaneloop.base.curve import FINE
 from vaneloop.base.forms import FORMS
 from vaneloop.identification import Effect, Parameter, Stage
 from vaneloop.identification.candidates.closed_forms import Formula
@@ -20,7 +21,7 @@ from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import diagnose_stage
 from vaneloop.identification.settings import LEAST_FALL, LEAST_OF_NOISE, LEVEL_SPREAD, NATS
 from vaneloop.identification.subsystem import Array
-from vaneloop.identification.unmodelled import fitted_candidate, problem
+from vaneloop.identification.unmodelled import fitted_candidate, learned_law, problem, spectral_lines
 from vaneloop.identification.unmodelled.closed_form_fits import Product, goes_on
 from vaneloop.identification.unmodelled.curve_candidates import (
     Candidate,
@@ -813,3 +814,103 @@ def test_logs_and_other_subsystems_may_speak_against_a_curve() -> None:
     before.errors = tried.errors = {"a": np.ones((1, 50)), "t": np.ones((1, 50))}
     CurveProblem.objection(own, before, tried)
     assert [d[0] for d in decided] == ["near", "logs", "elsewhere"]
+
+
+def test_stops_make_nothing_where_they_have_not_moved() -> None:
+    bound = BoundSystem(system(), [log(2.0 * U)])
+    q = {q.name: q for q in quantities(bound, np.array([2.0]))}["stops_of_u"]
+    c = curve_of(q)
+    a = np.arange(1.0, len(c.kept) + 1.0)
+    curve = c.placed().curve
+    assert curve is not None
+    whole = c.basis.design(c.grid) @ c.turn @ a
+    assert curve.table(a) == pytest.approx(whole - whole[0]) and abs(whole[0]) > 0.1
+    shifted = c.placed_as(lambda n: n[0] + np.arange(4.0), 1, (1.0, 5.0)).curve
+    assert shifted is not None and shifted.table(np.array([7.0])).tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert (shifted.low, shifted.high) == (1.0, 5.0) and (curve.low, curve.high) == (c.basis.low, c.basis.high)
+
+
+@dataclass
+class HeldFit:
+    """What is used of a fit."""
+
+    theta: Array
+    gradients: Array
+    prior: Array
+    free: Array = field(default_factory=lambda: np.array([0, 1]))
+    cost: Array = field(default_factory=lambda: np.array([1.0, 2.0]))
+    normals: Array = field(default_factory=lambda: np.array([np.eye(2), 2.0 * np.eye(2)]))
+    held_out: Array | None = None
+
+
+@pytest.mark.parametrize(("side", "gradient", "held"), [(1.0, 0.2, False), (1.0, 0.4, True), (-1.0, -0.2, False),
+                                                        (-1.0, -0.4, True), (0.5, 0.4, False)])  # fmt: skip
+def test_what_a_bound_holds_stays_there_whatever_block_is_left_out(side: float, gradient: float, held: bool) -> None:
+    """A curve's parameter at a bound, drawn outwards by the data and inwards by its prior of 0.3."""
+    judge: Any = SimpleNamespace(
+        scale=np.array([1.0, 1.0]), stage=SimpleNamespace(parameters=("own",), neutral=lambda: np.zeros(2)),
+        bounds=lambda: (np.array([-9.0, -1.0]), np.array([9.0, 1.0])),
+    )  # fmt: skip
+    fit: Any = HeldFit(
+        np.array([0.0, side]), np.array([[0.0, 0.75 * gradient], [0.0, 0.25 * gradient]]), np.array([0.0, 0.3])
+    )
+    judged = (np.array([3.0, 4.0]), 2.0 * fit.gradients, 3.0 * fit.normals)
+    if held:
+        assert fitted_candidate.with_held_out(judge, fit) is fit
+        assert fitted_candidate.with_held_out(judge, fit, judged).held_out.tolist() == [3.0, 4.0]
+        return
+    # by hand: one parameter, its normals 1 and 2 with a prior of 0.3; of each block the step that the other one takes
+    pull = gradient - 0.3 * side
+    left = [(pull - 0.75 * gradient) / 2.3, (pull - 0.25 * gradient) / 1.3]
+    wanted = [
+        c - 2.0 * s * g + s * s * n
+        for c, s, g, n in zip((1.0, 2.0), left, (0.75 * gradient, 0.25 * gradient), (1.0, 2.0), strict=True)
+    ]
+    assert fitted_candidate.with_held_out(judge, fit).held_out == pytest.approx(wanted, rel=1e-6)
+    counted = [
+        c - 2.0 * s * g + s * s * n
+        for c, s, g, n in zip((3.0, 4.0), left, (1.5 * gradient, 0.5 * gradient), (3.0, 6.0), strict=True)
+    ]
+    assert fitted_candidate.with_held_out(judge, fit, judged).held_out == pytest.approx(counted, rel=1e-6)
+    alone: Any = replace(fit, free=np.array([0, 0]))  # of a model without a curve nothing is held out
+    assert fitted_candidate.with_held_out(judge, alone) is alone
+
+
+def test_lines_that_are_hardly_apart_are_one_and_few_are_kept() -> None:
+    driven = SimpleNamespace(has=lambda g, alone: g == 3.0)
+    own: Any = SimpleNamespace(driven=[driven], shortest=10.0)  # two lines are 0.2 Hz apart at least
+    found = [(g, [], 1, 0.5) for g in (1.0, 1.19, 0.81, 3.0, 1.21, 0.5)]
+    wanted = [1.0, 1.21, 0.5][: spectral_lines.MOST_PERIODS]
+    assert [g for g, _ in Lines._own(own, found)] == [pytest.approx(1.0 / f) for f in wanted]  # type: ignore[arg-type]
+    assert Lines._own(own, [(2.0, [], 9, 0.1)]) == [(0.5, 9)]  # type: ignore[list-item]
+    assert Lines._own(own, [(2.0, [], 1, 0.1)]) == [(0.5, spectral_lines.HARMONICS)]  # type: ignore[list-item]
+    spike = np.zeros(2000)
+    spike[1000] = 100.0
+    assert about(spike) == pytest.approx(np.full(2000, 1e-10), rel=1e-9)
+
+
+@pytest.mark.parametrize("lent", [set(), {0}, {1}, {0, 1}])
+def test_a_band_goes_about_a_formula_as_far_as_the_parameters_leave_it(
+    lent: set[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Mean and slope that the model's own parameters have are no difference of a curve and its formula; beside a slope
+    its size is none either.
+    """
+    x = np.linspace(-1.0, 2.0, learned_law.POINTS)
+    f, been = np.sin(3.0 * x), x < 1.5
+    y = 1.4 * f + 0.3 * x - 0.7 + 0.1 * x**3
+    monkeypatch.setattr(learned_law, "values_of", lambda formula, at: f if at is x else None)
+    c: Any = SimpleNamespace(grid=x, lent=lent)
+    low, high = learned_law._with_formulas(c, y, y - 0.2, y + 0.5, been, ["formula"])  # type: ignore[list-item]
+    columns = [v for k, v in enumerate((np.ones(x.size), x)) if k in lent] + [f] * (1 in lent)
+    moved = f.copy()
+    if columns:
+        a = np.array(columns).T
+        moved += a @ np.linalg.lstsq(a[been], (y - f)[been], rcond=None)[0]
+    np.testing.assert_allclose(low, np.minimum(y, moved) - 0.2, atol=1e-9)
+    np.testing.assert_allclose(high, np.maximum(y, moved) + 0.5, atol=1e-9)
+
+
+def test_what_grounds_give_the_search_for_curves() -> None:
+    own = UserModelCandidates
+    assert (own.points, own.jumps, own.surfaces) == (FINE, True, True)
