@@ -1553,3 +1553,202 @@ def test_what_an_answer_takes_as_a_log() -> None:
     assert replay_verb.log_of(ours, Machine()) is ours
     with pytest.raises(LogError, match=r"^a.csv: no x_lvdt; it has n_dem, mine$"):
         replay_verb.log_of(log, Machine(), require=("n_dem", "x_lvdt"))
+
+
+def test_a_model_is_judged_where_what_drives_it_is_known() -> None:
+    """For one step before a driver's first sample and behind its last; of a single sample it is a constant."""
+    t = np.arange(11) * 0.1
+    slow, late = np.arange(3) * 0.2 + 0.31, np.arange(20) * 0.05 + 0.45
+    known, notes = parts._driven(
+        t, {"u": Channel(slow, slow), "w": Channel(late, late), "c": Channel(slow[:1], slow[:1])}
+    )
+    assert known == pytest.approx([0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]) and [n.split(":")[0] for n in notes] == ["u", "w"]
+    assert notes[0] == "u: logged from 0.31 to 0.71 s: what is measured outside does not count"
+    assert [(n.kind, n.of, n.number) for n in notes] == [("cut", "u", 1), ("cut", "w", 4)]
+    ends, _ = parts._driven(t, {"u": Channel(slow - 0.2, slow)})
+    assert ends == pytest.approx(t[:9])
+    whole, none = parts._driven(t, {"u": Channel(t, t)})
+    assert whole is t and none == []
+
+
+def test_channels_come_in_the_units_of_the_system() -> None:
+    y, u, flag = (Channel(T, T, unit=unit) for unit in ("um", "V", "-"))
+    log = Log("a.csv", {"y": y, "u": u, "z": flag, "other": u}, ["n"], {"y": "um", "u": "V", "z": "-", "other": "V"})
+    read = parts._in_units(log, {"y": "mm", "u": "V", "z": "mm"}, ["y", "u"])
+    assert read["y"].values == pytest.approx(1e-3 * T) and (read["y"].unit, read["z"].unit) == ("mm", "mm")
+    assert read["u"].values.tolist() == T.tolist() == read["z"].values.tolist() and list(read) == ["y", "u", "z"]
+    assert (read.path, list(read.notes)) == ("a.csv", ["n"])
+    with pytest.raises(LogError, match=r"^a.csv: u is in V; allowed: A or what converts to it$"):
+        parts._in_units(log, {"u": "A"}, [])
+    with pytest.raises(
+        LogError,
+        match=r"^a.csv: no v \(did you mean u\?\); it has y, u, z, other$|^a.csv: no v; it has y, u, z, other$",
+    ):
+        parts._in_units(log, {"v": "V"}, ["v"])
+    short = Log("a.csv", {"y": Channel(T[:1], T[:1], unit="mm")}, [], {"y": "mm"})
+    with pytest.raises(LogError, match=r"^a.csv: no y"):
+        parts._in_units(short, {"y": "mm"}, ["y"])
+    found, notes = parts.read_record(log, system(inputs={"u": "V"}, outputs={"y": "mm"}, model=lambda u, p: u.u))
+    assert found.name == "a.csv" and notes == ["a.csv: n"] and found.columns["y"] == pytest.approx(1e-3 * T)
+    moved = system(kind="force", model=lambda u, p: u.u, outputs={"y": "N"}, position="x", velocity="v",
+                   units={"position": "mm"})  # fmt: skip
+    assert parts.signals_of(moved) == {"x": "mm", "v": "", "u": "V", "y": "N"}
+
+
+def test_rows_without_time_stand_in_an_order_of_their_numbers_alone() -> None:
+    u = np.array([3.0, 1.0, 2.0, 5.0, 4.0, 7.0])
+    y = 10.0 * u
+    found = []
+    for order in (np.arange(6), np.array([5, 2, 0, 4, 1, 3])):
+        t = np.arange(6.0)
+        has = y[order] != 50.0  # of one row no output
+        channels = {"u": Channel(t, u[order]), "y": Channel(t[has], y[order][has])}
+        read: Any = SimpleNamespace(channels=channels, notes=["n"], path="folder/t.csv")
+        record, said = parts._without_order(read, system(outputs={"y": "mm"}, model=lambda u, p: u.u), "t.csv")
+        found.append(record.columns["u"].tolist())
+        assert record.columns["y"].tolist() == [10.0 * v for v in found[-1]] and record.t.tolist() == list(range(5))
+        assert said == ["t.csv: n", "t.csv: rows: 1 without an input, or without any output: left out"]
+        assert not record.ordered and list(record.notes) == said
+    assert found[0] == found[1] != sorted(found[0]) and sorted(found[0]) == [1.0, 2.0, 3.0, 4.0, 7.0]
+
+
+def test_logs_of_a_system_are_those_to_fit_and_those_to_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[Any] = []
+    monkeypatch.setattr(search, "bind", lambda *of: given.append(of) or "logs")
+    monkeypatch.setattr(search, "read_record", lambda x, system: (Record(x, T, {"y": T}), []))
+    pump, one, two = system(), record(), Record("two", T, {"y": T})
+    assert search.logs_for([one, "b.csv"], pump, "3:6", ["6:9", two, "c.csv"], None) == ("logs", "r")
+    ((of, fitted, tests, added),) = given
+    assert of is pump and added is None
+    assert [r.name for r in fitted] == ["r 3:6", "b.csv"] and [r.name for r in tests] == ["r 6:9", "two", "c.csv"]
+    search.logs_for("a.csv", pump, (), (), Model())
+    assert [r.name for r in given[1][1]] == ["a.csv"] and given[1][2] == [] and given[1][3] == Model()
+    monkeypatch.setattr(search, "bind", lambda *of: (_ for _ in ()).throw(StageError("no y")))
+    with pytest.raises(InputError, match="^no y$"):
+        search.logs_for(one, pump, (), (), None)
+
+
+def test_a_machine_s_log_is_bound_in_parts_and_takes_no_other_log(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = Log("a.csv", {"n_dem": Channel(T, 60.0 + T)})
+    asked: list[Any] = []
+    monkeypatch.setattr(search, "bind_parts", lambda *of: asked.append(of) or "chain")
+    machine = Machine()
+    assert search.chain_for(log, machine, "0:5", "5:9") == ("chain", "a.csv")
+    assert asked == [(machine, log, [Span(0.0, 5.0)], [Span(5.0, 9.0)])]
+    with pytest.raises(
+        InputError, match=r"^test='b.csv': the vane chain takes parts of its log, such as \(200, None\)$"
+    ):
+        search.chain_for(log, machine, (), "b.csv")
+    monkeypatch.setattr(search, "chain_for", lambda log, model, fit, test: (model, log))
+    monkeypatch.setattr(search, "diagnosed", lambda chain, name, workers, progress: (chain, name, workers, progress))
+    monkeypatch.setattr(search, "compared", lambda chain, name, progress=None: (chain, name, progress))
+    found: Any = search.diagnose("a.csv", machine, workers=5)
+    assert found[0] is machine and found[1:] == ("a.csv", 5, None)
+    usual: Any = search.diagnose("a.csv")
+    assert isinstance(usual[0], Machine) and usual[2] == 2
+    compared: Any = search.compare("a.csv", machine)
+    assert compared == (machine, "a.csv", None) and isinstance(search.compare("a.csv").__getitem__(0), Machine)  # type: ignore[attr-defined]
+
+
+def test_answers_about_stages_say_their_signals_as_rows_and_json(monkeypatch: pytest.MonkeyPatch) -> None:
+    signal = SimpleNamespace(signal="y", unit="mm", rms=0.5, rms_as_given=0.75, noise_floor=0.25, ratio=2.0, samples=9,
+                             json=lambda: {"signal": "y"})  # fmt: skip
+    x: Any = SimpleNamespace(stage="a", signals=[signal], fails=False, fit="f", json=lambda: {"stage": "a"})
+    bound: Any = SimpleNamespace(not_observed={"b": "x"}, notes=["n"], test=None)
+    s = search.Stages(bound, [x], "a.csv")
+    assert s.rows() == [{"subsystem": "a", "signal": "y", "unit": "mm", "rms": 0.5, "rms_as_given": 0.75,
+                         "noise_floor": 0.25, "ratio": 2.0, "samples": 9, "fails": False}]  # fmt: skip
+    plain = {"schema": 1, "log": "a.csv", "stages": [{"stage": "a"}], "not_observed": {"b": "x"}, "notes": ["n"]}
+    said = s.to_dict()
+    assert said.pop("done") == search.counted(["n"]) and said == plain and s.verdict == "agrees"
+    by_log: Any = SimpleNamespace(json=lambda: {"logs": [1], "notes": ["m"]})
+    own = search.Stages(bound, [x], "a.csv", by_log, held=HELD).to_dict()
+    assert own.pop("whole") == HELD.json() and own.pop("done") == search.counted(["m"])
+    assert own == plain | {
+        "signals": [{"signal": "y", "reference": "measured"}],
+        "logs": [1],
+        "notes": ["m"],
+        "verdict": "fails",
+    }
+    monkeypatch.setattr(
+        search, "tested", lambda bound, fits: fits and [parts.Tested("a", "y", "mm", 1.0, 0.5, 0.25, 4)]
+    )
+    assert search.Stages(bound, [x], "a.csv").to_dict()["tested"] == [
+        {
+            "stage": "a",
+            "signal": "y",
+            "unit": "mm",
+            "error_before": 1.0,
+            "error_after": 0.5,
+            "noise_floor": 0.25,
+            "samples": 4,
+        }
+    ]
+    found = SimpleNamespace(effect="lag")
+    stage: Any = SimpleNamespace(
+        stage="a", verdict="missing", outputs=["y", "z"], units=["mm", "V"], floor=np.array([0.1, 0.2]),
+        error_before=np.array([1.0, 2.0]), error_after=np.array([0.5, 0.25]), effects=[found, found], base="b",
+        final="f",
+    )  # fmt: skip
+    diagnosis: Any = SimpleNamespace(stages=[stage], verdict="missing")
+    monkeypatch.setattr(
+        search, "diagnosis_json", lambda d, log: {"log": log, "notes": ["n"], "effects": [{"effect": "lag"}]}
+    )
+    d = search.Diagnosed(bound, diagnosis, "a.csv", held=HELD)
+    assert d.rows()[1] == {"subsystem": "a", "verdict": "missing", "signal": "z", "unit": "V", "error_before": 2.0,
+                           "error_after": 0.25, "noise_floor": 0.2, "effects": "lag, lag"}  # fmt: skip
+    assert len(d.rows()) == 2 and d.effects == ["lag"] and d.verdict == "missing"
+    said = d.to_dict()
+    assert said["whole"] == HELD.json() and said["done"] == search.counted(["n"]) and len(said["tested"]) == 1  # type: ignore[arg-type]
+    assert "whole" not in search.Diagnosed(bound, diagnosis, "a.csv").to_dict()
+    assert search.Diagnosed(bound, diagnosis, "a.csv", by_log).to_dict()["logs"] == [1]
+
+
+def test_an_experiment_says_what_it_recommends() -> None:
+    diagnosed: Any = SimpleNamespace(diagnosis=SimpleNamespace(notes=["n"]), _fits=lambda: ["fit"], _curves="curves")
+    none = search.Experiment(diagnosed, None, "a.csv")
+    assert none.sentence() == "Nothing to separate: the log leaves no rivals." and none.rows() == []
+    assert none.to_dict() == {"schema": 1, "log": "a.csv", "recommended": None, "profiles": [], **search.told(["n"])}
+    table: Any = [{"profile": "p", "score": 3.0, "by_pair": {}}, {"profile": "q", "score": 1.0}]
+    run: Any = {
+        "text": "Ramp it.", "profile": "p", "score": 3.0, "separates": True, "repeats": 2, "t": T,
+        "inputs": {"n_dem": ("%", T), "i": ("mA", 2.0 * T)}, "table": table, "heads": {"nats": "x"},
+    }  # fmt: skip
+    e = search.Experiment(diagnosed, run, "a.csv")
+    assert str(e) == "Ramp it." and e.rows() == [{"profile": "p", "score": 3.0}, {"profile": "q", "score": 1.0}]
+    best = {"nats": 3.0, "profile": "p", "repeats": 2, "separates": True, "text": "Ramp it."}
+    assert e.to_dict() == {"schema": 1, "log": "a.csv", "recommended": best, "profiles": table, **search.told(["n"])}
+    other: Any = search.Experiment(diagnosed, {**run, "heads": {"score": "x"}}, "a.csv").to_dict()["recommended"]
+    assert other["score"] == 3.0 and "nats" not in other
+    assert e._fits() == ["fit"] and e._worked_out() == "curves"  # type: ignore[comparison-overlap]
+    ax = pytest.importorskip("matplotlib.figure").Figure().subplots()
+    e.plot(ax)
+    assert [line.get_label() for line in ax.get_lines()] == ["n_dem [%]", "i [mA]"]
+    assert ax.get_lines()[1].get_ydata().tolist() == (2.0 * T).tolist() and ax.get_ylabel() == "n_dem [%], i [mA]"
+
+
+def test_an_extended_model_is_explained_at_its_floor(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = SimpleNamespace(
+        stage="a", steps=[("nominal", 9.0), ("lag", 1.0)], verdict="missing", effects=["lag"], good=True
+    )
+    two = SimpleNamespace(stage="b", steps=[], verdict="missing", effects=[], good=False)
+    monkeypatch.setattr(search, "reached", lambda s: s.good)
+    monkeypatch.setattr(search.Diagnosed, "to_dict", lambda self: {"stages": [
+        {"stage": "a", "verdict": "missing"}, {"stage": "b", "verdict": "missing"}, {"stage": "c", "verdict": "none"}
+    ]})  # fmt: skip
+
+    def answer(stages: Sequence[Any], refused: str = "") -> search.Extended:
+        return search.Extended(None, SimpleNamespace(stages=stages), "a.csv", refused=refused, path="m.toml")  # type: ignore[arg-type]
+
+    assert answer([one]).verdict == "explained" and answer([one, two]).verdict == "missing"
+    assert answer([one], "worse").verdict == "missing" and answer([one]).reached and not answer([two]).reached
+    said = answer([one, two]).to_dict()
+    assert said["stages"] == [
+        {"stage": n, "verdict": v} for n, v in (("a", "explained"), ("b", "missing"), ("c", "none"))
+    ]
+    assert said["waterfall"] == {
+        "a": [{"step": "nominal", "noise_floors": 9.0}, {"step": "lag", "noise_floors": 1.0}],
+        "b": [],
+    }
+    assert (said["model"], said["verdict"]) == ("m.toml", "missing")
+    assert answer([one], "worse").to_dict()["stages"][0]["verdict"] == "missing"  # type: ignore[index]
