@@ -122,6 +122,8 @@ def test_its_own_quantities_are_what_it_says(good: str, tmp_path: Path) -> None:
 def test_a_plain_controller_shows_and_keeps_nothing(gcc: str, tmp_path: Path) -> None:
     foreign = Program(wrong(gcc, tmp_path)).start(CAL)
     assert observables(foreign) == own_scalars(foreign) == {} and save(foreign) is None
+    half = Program(wrong(gcc, tmp_path, top="size_t vaneloop_save(void *at) { return 1; }")).start(CAL)
+    assert save(half) is None  # what could not be given back
     (tmp_path / "own.toml").write_text("gain = { value = 3.0 }")
     with pytest.raises(InputError, match="allowed: none; it has no vaneloop_describe"):
         Program(str(tmp_path / "wrong.so"), str(tmp_path / "own.toml")).start(CAL)
@@ -622,6 +624,22 @@ def test_what_was_said_before_is_written_once(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(sys, "stderr", None)
     isolation._flush()
     assert inside == (1, 1) and (out.flushed, error.flushed) == (2, 1)
+
+
+def test_what_a_task_prints_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its streams are its own copies, and its process ends without what libraries do at an end."""
+
+    def says(fails: bool) -> None:
+        print("said", fails)
+        if fails:
+            raise ValueError("so")
+
+    with (tmp_path / "out").open("w") as out:
+        monkeypatch.setattr(sys, "stdout", out)
+        isolated(lambda: says(False))
+        with pytest.raises(ValueError, match="^so$"):
+            isolated(lambda: says(True))
+        assert (tmp_path / "out").read_text() == "said False\nsaid True\n"
 
 
 def test_signals_go_on_to_the_controller_and_stops_are_waited_out() -> None:

@@ -355,7 +355,6 @@ def restore(foreign: Foreign, state: bytes | None) -> None:
     """Give the controller a state that `save` took."""
     running = _KEPT[foreign.at_fed]
     library = running.library
-    library.vaneloop_restore.argtypes = [ctypes.c_void_p]
     with calling(running.head, "vaneloop_restore"):
         library.vaneloop_restore(state)
 
