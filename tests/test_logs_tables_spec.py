@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime as dt
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,14 @@ from hypothesis import strategies as st
 
 from hil.logs import Channel, Log, LogError, csv_format, offered, read_log, source, write_log
 from hil.logs import log as logs
+from hil.logs.channels import Channels, NoChannel, raster
 from hil.logs.dates import OddRow, from_dates
+from hil.logs.guess import feed_forward
 from hil.logs.mapping import Bench, read_mapping, write_mapping
 from hil.logs.opening import open_log
+from hil.logs.scale import _mean_over, _usual, proposed_scale
 from hil.logs.source import ABSENT, check_file, close_names, is_absent, names_held, numbers, read_bytes
+from hil.logs.stale import _turns, stale_rows
 from hil.logs.survey import MOST_LISTED, Row, Survey, sparkline, survey
 from hil.logs.table import NoTime, split_unit
 from hil.logs.times import guess_column, guess_unit
@@ -1082,3 +1087,156 @@ def test_a_quotation_mark_that_nobody_closes_is_refused_with_its_row(
 def test_a_cell_in_quotation_marks_may_hold_lines(tmp_path: Path) -> None:
     text = 't,n_dem,remark\n0,50,"a ""b"" \n c, d"\n1,51,5"\n'
     assert values(csv(tmp_path, text)) == [50.0, 51.0]
+
+
+# ---- channels as a frame ---------------------------------------------------------------------------------------------
+
+
+def test_a_channel_is_its_samples() -> None:
+    c = Channel(np.array([1.0, 2.0, 4.0]), np.array([5.0, -3.0, 7.5]))
+    assert (c.framed, c.unit, c.apart) == (False, "", 0.0) and len(c) == 3 and bool(c) and list(c) == [5.0, -3.0, 7.5]
+    assert np.mean(c) == pytest.approx(9.5 / 3) and np.array(c, dtype=int).tolist() == [5, -3, 7]
+    part = dataclasses.replace(c, unit="mm", framed=True)[1.5:4]
+    assert part.t.tolist() == [2.0] and part.values.tolist() == [-3.0] and (part.unit, part.framed) == ("mm", True)
+    assert c[:].t.tolist() == [1.0, 2.0, 4.0] and c[2:].values.tolist() == [-3.0, 7.5]
+    assert (
+        repr(c) == "Channel(3 samples, 1 to 4 s, -3 to 7.5)"
+        and repr(part) == "Channel(1 samples, 2 to 2 s, -3 to -3 mm)"
+    )
+    assert repr(dataclasses.replace(c, unit="-")) == repr(c)
+    none = Channel(np.empty(0), np.empty(0), unit="mm")
+    assert repr(none) == "Channel(no sample mm)" and bool(none) and len(none) == 0
+    with pytest.raises(LogError, match=r"^channel\[3\]: allowed: a slice in s, such as channel\[10:20\]"):
+        c[3]  # type: ignore[index]
+    with pytest.raises(LogError, match=r"^step \(=2\) of a slice must be left out: a log is cut by its time"):
+        c[0:3:2]
+
+
+def test_channels_of_a_run_are_a_frame_by_name_and_by_time() -> None:
+    t = np.arange(5.0)
+    a, b = Channel(t, 10.0 * t, unit="mm"), Channel(t[1:] + 0.5, t[1:], True, "mA")
+    run = Channels("folder/r.csv", {"a": a, "b": b})
+    assert (
+        run["a"] is a and list(run) == run.columns == list(run.keys()) == ["a", "b"] and "a" in run and "c" not in run
+    )
+    assert (
+        list(run.values()) == [a, b] and dict(run.items()) == {"a": a, "b": b} and run.units == {"a": "mm", "b": "mA"}
+    )
+    assert len(run) == 9 and run.t.tolist() == [0.0, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5] and bool(run)
+    assert run[["b"]].channels == {"b": b} and run[["b"]].path == "folder/r.csv"
+    part = run[2:4]
+    assert part["a"].t.tolist() == [2.0, 3.0] and part["b"].t.tolist() == [2.5, 3.5] and part["b"].framed
+    assert list(run[0:1]) == ["a"]  # a channel without a sample is left out
+    assert repr(run) == "Channels('r.csv', 9 rows, 0 to 4.5 s: a [mm], b [mA])"
+    assert Channels("x", {"a": a}).t is a.t and len(Channels("x", {"a": a, "c": dataclasses.replace(a)})) == 5
+    empty = Channels("x", {})
+    assert repr(empty) == "Channels('x', no rows)" and bool(empty) and len(empty) == 0
+    many = Channels("x", {f"c{k}": a for k in range(10)})
+    assert repr(many).endswith("c7 [mm] and 2 more)") and "more" not in repr(many[[f"c{k}" for k in range(8)]])
+    with pytest.raises(LogError, match=r"^folder/r.csv: no sample in '7:9'; the log is from 0 to 4.5 s$"):
+        run[7:9]
+    with pytest.raises(LogError, match=r"^x: no sample in ':3'; the log has none at all$"):
+        empty[:3]
+    with pytest.raises(NoChannel, match=r"^folder/r.csv: no channel 'aa' \(did you mean a\?\); it has a, b$"):
+        run["aa"]
+    with pytest.raises(KeyError):
+        run[["a", "x"]]
+    for wrong in (3, ["a", 3], ("a",)):
+        with pytest.raises(LogError, match=r"allowed: a name, a list of names, or a slice in s such as log\[10:20\]$"):
+            run[wrong]  # type: ignore[index]
+    times, columns = raster(run.channels)
+    assert (
+        times.tolist() == run.t.tolist() and columns["a"][:4].tolist()[:2] == [0.0, 10.0] and np.isnan(columns["a"][2])
+    )
+    assert columns["b"][[2, 4]].tolist() == [1.0, 2.0] and np.isnan(columns["b"][[0, 1, 3]]).all()
+    assert raster({})[0].size == 0
+    made = run.assign(twice="2 * a [um]", c=b, more="twice + 1")
+    assert made["twice"].values.tolist() == [0.0, 2e4, 4e4, 6e4, 8e4] and made["twice"].unit == "um" and made["c"] is b
+    assert made["more"].values[1] == 2e4 + 1 and list(run) == ["a", "b"]
+    frame = run.to_pandas()
+    assert frame.attrs == {"name": "folder/r.csv", "units": run.units, "framed": ["b"]} and frame.index.name == "t"
+    assert run.to_frame().equals(frame) and a.to_pandas().attrs == {"unit": "mm"} and a.to_pandas().index.name == "t"
+    cell = run._repr_html_()
+    assert cell.count("<tr>") == 3 and ">20<" in cell and "r.csv: 9 rows" in cell and ">40<" in cell
+
+
+# ---- rows that were written again ------------------------------------------------------------------------------------
+
+
+def test_rows_that_repeat_every_channel_are_stale_where_noise_makes_that_no_chance() -> None:
+    draw = np.random.default_rng(2)
+    columns = [draw.standard_normal(4000).round(2) for _ in range(6)]
+    stale = np.zeros(4000, dtype=bool)
+    stale[[100, 101, 102, 900, 1500, 1501, 3999]] = True
+    for v in columns:
+        v[:] = v[np.maximum.accumulate(np.where(stale, 0, np.arange(4000)))]
+    assert np.flatnonzero(stale_rows(columns)).tolist() == np.flatnonzero(stale).tolist()
+    assert not stale_rows([*columns, np.arange(4000.0)]).any()  # one of them is always new
+    flat = np.repeat(np.arange(400.0), 10)  # without noise nothing is stale
+    assert not stale_rows([flat, flat]).any() and not stale_rows([]).any() and not stale_rows([columns[0][:9]]).any()
+    slow = [np.repeat(v[:1000], 3) for v in columns]  # two rows in three: channels that are slower than the rows
+    assert not stale_rows(slow).any()
+    assert _turns(np.tile([0.0, 1.0], 20)) == 1.0 and _turns(np.arange(40.0)) == 0.0
+    assert _turns(np.tile([0.0, 1.0], 5)) == 0.0  # too few to say
+    assert _turns(np.tile([0.0, 1.0, 1.0, 2.0, 2.0, 0.0], 10)) == pytest.approx(2 / 3, abs=0.03)
+
+
+# ---- gain and zero that a log says -----------------------------------------------------------------------------------
+
+
+def test_the_scale_of_a_signal_is_that_of_its_peer() -> None:
+    t = np.arange(400) * 0.05
+    n = 70.0 + 20.0 * np.sin(0.5 * t)
+    peers = {"n_r": (t, n)}
+
+    def of(values: Any, signal: str = "n_dem", channels: Any = peers, at: Any = t) -> tuple[str, str] | None:
+        return proposed_scale(signal, (at, values), channels, {})
+
+    assert of(n) is None and of(n / 100.0) == ("100*%", "n_r") and of(n / 152.0) == ("152*%", "n_r")
+    assert of(n + 30.0) == ("%-30", "n_r") and of(-n) == ("-%", "n_r") and of(-(n - 50.0) / 4.0) == ("-4*%+50", "n_r")
+    assert of(n + 0.79) is None and of(n + 0.82) == ("%-0.82", "n_r")  # a fiftieth of what the peer moves
+    zero = f"%{np.median(n - n / 1.09):+.4g}"  # within a tenth the gain is taken for 1
+    assert of(n / 1.09) == (zero, "n_r") and of(n / 1.12) == ("1.12*%", "n_r")
+    noise = np.random.default_rng(1).standard_normal(400)
+    follows = 2.0 * n + np.std(n) * 2.0 * noise * np.sqrt(1.0 / 0.975**2 - 1.0)
+    loose = 2.0 * n + np.std(n) * 2.0 * noise * np.sqrt(1.0 / 0.96**2 - 1.0)
+    assert of(follows) is not None and of(loose) is None
+    assert of(n[:49] / 100.0, at=t[:49]) is None and of(n[:50] / 100.0, at=t[:50]) is not None
+    assert of(n / 100.0, at=t + 17.55) is None and of(np.full(400, 3.0)) is None and of(n / 100.0, channels={}) is None
+    assert of(n / 100.0, "n_r", {"n_dem": (t, n)}) == ("100*%", "n_dem")
+    x = 24.0 + 10.0 * np.sin(0.5 * t)
+    assert of(x / 25.4, "x_lvdt", {"x_dem": (t, x)}) == ("25.4*mm", "x_dem")
+
+
+@pytest.mark.parametrize(
+    ("gain", "usual"), [(1.04, 1.0), (9.7, 10.0), (0.0243, 0.025), (-41.0, -40.0), (1.37, 1.5), (1.2, 1.2), (7.0, 7.0)]
+)
+def test_a_gain_is_one_that_people_choose_where_it_is_as_good(gain: float, usual: float) -> None:
+    assert _usual(gain) == pytest.approx(usual)
+
+
+def test_a_mean_is_that_of_what_lies_a_tenth_of_a_second_around() -> None:
+    t = np.array([0.0, 0.0625, 0.125, 0.25, 1.0])
+    assert _mean_over(t, np.array([1.0, 2.0, 6.0, 4.0, 8.0])) == pytest.approx([1.5, 3.0, 4.0, 4.0, 8.0])
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_the_scale_of_a_valve_s_current_is_that_of_the_stroke_s_rate(side: float) -> None:
+    """i = kff v + d sign(v) + i0, in mA for mm/s."""
+    t = np.arange(2000) * 0.01
+    x = 24.0 + 12.0 * np.sin(0.6 * t)
+    kff = feed_forward({})
+    v = (np.interp(t + 0.1, t, x) - np.interp(t - 0.1, t, x)) / 0.2
+    i = kff * v + 0.4 * np.sign(v)
+    channels = {"x_lvdt": (t, x)}
+
+    def of(values: Any, channels: Any = channels) -> tuple[str, str] | None:
+        return proposed_scale("i_cmd", (t, values), channels, {})
+
+    assert of(i) is None and of(1.1 * i) is None
+    assert of(side * i / 40.0) == (f"{side * 40:g}*mA", "the rate of x_lvdt")
+    assert of(side * i / 40.0 + 0.5)[0] == f"{side * 40:g}*mA{-side * 20:+g}"  # type: ignore[index]
+    assert of(i + 4.0) is None and of(i + 6.0) == ("mA-6", "the rate of x_lvdt")  # a valve may have a null bias
+    assert of(-i) == ("-mA", "the rate of x_lvdt") and of(i / 40.0, {"x_dem": (t, x)}) == ("40*mA", "the rate of x_dem")
+    assert of(np.random.default_rng(1).standard_normal(2000)) is None and of(i, {}) is None
+    assert of(i / 40.0, {"x_lvdt": (t, 24.0 + 0.5 * np.sin(0.6 * t))}) is None  # it hardly moves

@@ -1011,12 +1011,14 @@ def test_a_secured_run_gives_what_was_taken_and_sent_tick_by_tick() -> None:
 
         def __init__(self, head: int) -> None:
             self.head, self.node, self.k, self.heard, self.asked = head, self, 0, [], []
+            self.heads: set[int] = set()
 
         def set_demand(self, n_dem: float, n_r: float) -> None:
             self.asked.append((n_dem, n_r))
 
         def tick(self, rows: np.ndarray) -> np.ndarray:
             self.heard.append(len(rows))
+            self.heads |= set(rows[:, 0].tolist())
             self.k += 1
             return np.array([[self.head, self.k]] if self.k % 3 == 1 else np.zeros((0, 2)), np.int64).reshape(-1, 2)
 
@@ -1031,6 +1033,10 @@ def test_a_secured_run_gives_what_was_taken_and_sent_tick_by_tick() -> None:
     assert got.taken_at[0] == 0 and got.taken[0].tolist() == [frames.FRESHNESS, 99]
     assert got.taken_at[1:].tolist() == list(range(1, 30, 3)) and got.taken[1:, 0].tolist() == [heads[0]] * 10
     assert ecu.heard[0] == 1 and vgv.heard[:3] == [1, 1, 0] and got.run.error_frames == 0
+    assert (ecu.heads, vgv.heads) == ({frames.FRESHNESS, heads[1]}, {frames.FRESHNESS, heads[0]})  # each the other
+    other = Silent(heads[1])
+    longer = run_secured(profile, other, Silent(heads[0]), start=99, duration=0.6)  # type: ignore[arg-type]
+    assert longer.run.simulated_s == pytest.approx(0.6) and other.k == 600
 
 
 def test_an_ecu_begins_at_its_demand_and_hears_so_many_frames_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1061,8 +1067,11 @@ def test_an_ecu_begins_at_its_demand_and_hears_so_many_frames_at_once(monkeypatc
             wide.append(len(received))
             return received[:0]
 
-    run_realtime(Wide(), Empty(), ticks=2, ticker=ticker)  # type: ignore[arg-type]
+    report = run_realtime(Wide(), Empty(), ticks=2, ticker=ticker)  # type: ignore[arg-type]
     assert set(rooms) == {64} and set(wide) == {64 + 4}  # and the notes of the loop and of the node
+    # of each tick: late by the sleep's 50 us beside what spins, its work, and both from the deadline on
+    assert report.end.count == report.work.count == report.begin.count == 2
+    assert report.end.worst_ns == report.begin.worst_ns + report.work.worst_ns < MS
 
 
 def test_a_wall_clock_is_that_of_the_beginning(monkeypatch: pytest.MonkeyPatch) -> None:
