@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
+import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,12 +17,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.logs import Channel, Log, LogError, csv_format, offered, read_log, source, write_log
+from hil.logs import Channel, Log, LogError, csv_format, offered, plausible, read_log, source, write_log
+from hil.logs import joined as joined_rows
 from hil.logs import log as logs
 from hil.logs.channels import Channels, NoChannel, raster
 from hil.logs.dates import OddRow, from_dates
 from hil.logs.guess import feed_forward
+from hil.logs.joined import Joined, joined, seems_joined
 from hil.logs.mapping import Bench, read_mapping, write_mapping
+from hil.logs.notes import Note
 from hil.logs.opening import open_log
 from hil.logs.scale import _mean_over, _usual, proposed_scale
 from hil.logs.source import ABSENT, check_file, close_names, is_absent, names_held, numbers, read_bytes
@@ -1240,3 +1245,131 @@ def test_the_scale_of_a_valve_s_current_is_that_of_the_stroke_s_rate(side: float
     assert of(-i) == ("-mA", "the rate of x_lvdt") and of(i / 40.0, {"x_dem": (t, x)}) == ("40*mA", "the rate of x_dem")
     assert of(np.random.default_rng(1).standard_normal(2000)) is None and of(i, {}) is None
     assert of(i / 40.0, {"x_lvdt": (t, 24.0 + 0.5 * np.sin(0.6 * t))}) is None  # it hardly moves
+
+
+# ---- from samples to channels ----------------------------------------------------------------------------------------
+
+
+def test_rows_with_a_wrong_stamp_have_no_time_unless_a_channel_has_them_for_itself() -> None:
+    t = np.arange(200) * 0.1
+    t[50:53] = 900.0
+    known: dict[int, Any] = {}
+    notes: list[str] = []
+    s: Any = SimpleNamespace(t=t, values=np.ones(200), word="row", first=2)
+    out = logs._in_time(s, t, known, notes)
+    (note,) = notes
+    assert note == "time: 3 of 200 rows have a wrong time stamp (first row 52: 900 s): left out"
+    assert isinstance(note, Note) and (note.kind, note.of, note.number, note.rows) == (
+        "left out",
+        "time",
+        3,
+        (52, 53, 54),
+    )
+    assert is_absent(out[50:53]).all() and out[:50].tolist() == t[:50].tolist() and t[51] == 900.0
+    own = np.full(200, np.nan)
+    own[48:53] = 1.0  # three of its five samples
+    again: Any = SimpleNamespace(t=t, values=own, word="row", first=2)
+    assert logs._in_time(again, t, known, notes) is t and len(notes) == 1
+    own[40:53] = 1.0
+    assert is_absent(logs._in_time(again, t, known, notes)[51]) and len(known) == 1
+    good = np.arange(200) * 0.1
+    plain: Any = SimpleNamespace(t=good, values=np.ones(200), word="row", first=2)
+    assert logs._in_time(plain, good, known, notes) is good and len(notes) == 1
+
+
+def test_of_each_table_stale_rows_are_left_out_once() -> None:
+    draw = np.random.default_rng(3)
+    t, stale = np.arange(3000) * 0.01, np.zeros(3000, dtype=bool)
+    stale[[200, 201, 700]] = True
+    at = np.maximum.accumulate(np.where(stale, 0, np.arange(3000)))
+    names = [f"c{k}" for k in range(6)]
+    made = {n: Channel(t if k % 2 else t.copy(), draw.standard_normal(3000).round(2)[at]) for k, n in enumerate(names)}
+    made["framed"] = Channel(t, made["c0"].values, framed=True)
+    made["alone"] = Channel(t[1:], made["c1"].values[1:])
+    notes: list[str] = []
+    out = logs._fresh(made, notes)
+    assert [str(n) for n in notes] == [
+        "c0, c1, c2, c3, c4, c5: 3 of 3,000 rows repeat the row before in every channel (the first at 2 s): stale, "
+        "left out"
+    ]
+    assert isinstance(notes[0], Note) and (notes[0].kind, notes[0].of, notes[0].number) == ("left out", "time", 3)
+    for n in names:
+        assert out[n].t.tolist() == t[~stale].tolist() and out[n].values.tolist() == made[n].values[~stale].tolist()
+    assert out["framed"] is made["framed"] and out["alone"] is made["alone"] and list(out) == list(made)
+
+
+def test_samples_that_an_exporter_joined_are_taken_at_their_own_rate() -> None:
+    """Every fifth row is a sample, the first in row 2; a command that seldom bends keeps its lines."""
+    t = np.arange(3000) * 0.01
+    true = np.random.default_rng(4).standard_normal(601).round(3)
+    rows = np.arange(3000)
+    slow = np.interp(rows, 2 + 5 * np.arange(-1, 600), true)
+    bends = np.interp(rows, np.r_[0, 20 * np.cumsum([7, 8] * 10)], np.r_[0.0, np.tile([10.0, 3.0], 10)])
+    made = {"slow": Channel(t, slow), "seldom": Channel(t, bends), "fast": Channel(t, np.sin(t * 77.0).round(4))}
+    notes: list[str] = []
+    out = logs._own_samples(made, notes)
+    assert joined(t, slow) == Joined(5, 2, True) and out["fast"] is made["fast"]
+    assert out["slow"].t.tolist() == t[2::5].tolist() and out["slow"].values == pytest.approx(true[1:601], abs=1e-9)
+    assert (out["slow"].apart, made["slow"].apart) == (pytest.approx(0.05), 0.0)
+    assert (
+        str(notes[0]) == "slow: samples 0.05 s apart are joined by straight lines: only these are taken, 600 of 3,000"
+    )
+    assert isinstance(notes[0], Note) and (notes[0].kind, notes[0].of, notes[0].number) == ("left out", "slow", 2400)
+    assert joined(t, bends) == Joined(20, 0, False) and out["seldom"].values is made["seldom"].values
+    assert out["seldom"].apart == pytest.approx(0.2) and len(notes) == 2
+    assert str(notes[1]) == "seldom: samples 0.2 s apart are joined by straight lines"
+    assert isinstance(notes[1], Note) and (notes[1].kind, notes[1].number) == ("filled", 2850)
+    assert logs._own_samples({"fast": made["fast"]}, notes) == {"fast": made["fast"]} and len(notes) == 2
+    framed = {"slow": dataclasses.replace(made["slow"], framed=True)}
+    assert logs._own_samples(framed, notes) is framed  # a value holds from its frame on
+
+
+@pytest.mark.parametrize(("every", "first"), [(2, 1), (3, 0), (7, 4), (20, 11)])
+def test_true_samples_are_found_by_where_the_line_bends(every: int, first: int) -> None:
+    n = 2400
+    at = first + every * np.arange(-1, n // every + 2)
+    values = np.interp(np.arange(n), at, np.random.default_rng(every).standard_normal(at.size))
+    t = 5.0 + 0.02 * np.arange(n)
+    assert joined(t, values) == Joined(every, first, True) and seems_joined(t, values)
+    assert joined(t, values, fewest=n) is None and joined(t[:59], values[:59]) is None
+    noisy = values + 1e-3 * np.random.default_rng(1).standard_normal(n)
+    assert joined(t, noisy) is None and not seems_joined(t, noisy)
+    uneven = t + np.where(np.arange(n) % 9 == 0, 0.1, 0.0) * 0.02
+    assert joined(uneven, values) is None  # times by a twentieth of a step off
+    assert joined(t, np.zeros(n)) is None and joined(t, 3.0 * t) is None
+
+
+def test_the_last_digit_is_that_of_numbers_of_one_size() -> None:
+    def digits(*values: float) -> list[float]:
+        return joined_rows._last_digit(np.array(values)).tolist()
+
+    assert (
+        digits(1.25, 3.75, 9.5) == [0.01]
+        and digits(1.2, 1.5, 9.0) == [pytest.approx(0.1)]
+        and digits(3.0, 4.0) == [1.0]
+    )
+    assert digits(1.25, 10.5, 2.75, 99.0) == pytest.approx([0.01, 0.1, 0.01, 0.1])
+    odd = math.pi * np.arange(1.0, 3.0)
+    assert joined_rows._last_digit(odd) == pytest.approx([2e-9 * math.pi])  # of the largest
+    assert joined_rows._size(np.array([0.0, 0.05, 1.0, 9.99, 10.0])).tolist() == [-12.0, -2.0, 0.0, 0.0, 1.0]
+
+
+def test_time_from_1970_or_far_away_is_counted_from_the_start() -> None:
+    def shifted(start: float, era: str = "1970") -> tuple[list[float], list[str]]:
+        t = start + np.arange(3.0)
+        channels = {"a": Channel(t, t), "b": Channel(t, t), "c": Channel(t[:2] + 0.5, t[:2])}
+        notes: list[str] = []
+        logs._shift(channels, notes, era)
+        assert channels["a"].t is channels["b"].t and channels["c"].t[0] == channels["a"].t[0] + 0.5
+        return channels["a"].t.tolist(), [str(n) for n in notes]
+
+    assert shifted(1.7e9, "1904") == (
+        [0.0, 1.0, 2.0], ["time counts from 1904: 1700000000.000000 s taken for the start of the log"]
+    )  # fmt: skip
+    far = plausible.JUMP
+    assert shifted(far) == ([far, far + 1.0, far + 2.0], [])
+    assert shifted(far + 10.0)[1] == [
+        f"time does not count from the start: {far + 10.0:.6f} s taken for the start of the log"
+    ]
+    assert shifted(-far - 10.0)[0] == [0.0, 1.0, 2.0]
+    logs._shift({}, [], "1970")
