@@ -7,6 +7,7 @@ test gives, so that each rule is seen alone.
 from __future__ import annotations
 
 import dataclasses
+import struct
 import subprocess
 import sys
 import zlib
@@ -21,7 +22,7 @@ import pytest
 from controller import MODES, load_calibration
 from hil.bus.frames import ERROR, EXTENDED, FD, IDENT_MASK, REMOTE
 from hil.calibrate.slave import key_of
-from hil.inject import fuzz, fuzz_tools
+from hil.inject import fuzz, fuzz_tools, tool_rules
 from hil.inject.fuzz import KINDS, Attack, Bench, Campaign, good_frames, make_attack, read_attack, run_attack
 from hil.inject.fuzz_tools import ToolCampaign
 from hil.loop.node import MOST_SENT, Node, node_tick
@@ -961,3 +962,212 @@ def test_the_memory_of_the_process_is_its_own_and_not_that_of_what_started_it() 
     code = "from hil.inject.fuzz_tools import _resident; print(_resident())"
     told = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     assert float(told) < fuzz_tools._resident() - 100.0 and len(held) > 0
+
+
+# ---- the rules of hostile tools --------------------------------------------------------------------------------------
+
+
+class Drawn:
+    """A tool whose draws are told beforehand: of choices the place, of whole numbers the number; what it was asked."""
+
+    def __init__(self, *draws: int, keys: bool = True, **more: Any) -> None:
+        self.draws, self.asked, self.keys = list(draws), [], keys
+        memory = SimpleNamespace(elements=[SimpleNamespace(low=k + 0.5, high=k + 2.0) for k in range(5)])
+        self.slave = SimpleNamespace(connected=True, _seed=None, memory=memory, _commands={0xF5: 1, 0xF7: 1})
+        self.server = SimpleNamespace(session=1, _seed=None, _services={0x22: 1, 0x27: 1})
+        self.rng = SimpleNamespace(normal=lambda: 1.25, uniform=lambda low, high: 0.5 * (low + high))
+        vars(self.slave).update(more)
+        vars(self.server).update(more)
+
+    def of(self, *choices: Any) -> Any:
+        self.asked.append(choices)
+        return choices[self.draws.pop(0) if self.draws else 0]
+
+    def below(self, n: int) -> int:
+        self.asked.append(n)
+        return self.draws.pop(0) if self.draws else 0
+
+    def noise(self, least: int, most: int) -> bytes:
+        self.asked.append((least, most))
+        return bytes(range(1, 1 + least)) if least else b""
+
+    def key(self, seed: bytes) -> bytes:
+        return b"K" + seed
+
+
+def said(rule: Any, *draws: int, **more: Any) -> list[str]:
+    """The bytes of a rule's frames."""
+    return [data.hex() for _, data in rule(Drawn(*draws, **more))]
+
+
+def test_a_hostile_xcp_tool_opens_and_asks_for_locks() -> None:
+    assert [i for i, _ in tool_rules.leave(Drawn())] == [tool_rules.MASTER] * 2  # type: ignore[arg-type]
+    assert said(tool_rules.connect) == ["ff00"] and said(tool_rules.leave) == ["fe", "ff00"]
+    assert said(tool_rules.open_xcp, connected=False) == ["ff00"]
+    t = Drawn()
+    assert tool_rules.open_xcp(t) == [(tool_rules.MASTER, bytes([0xF8, 0, *list(tool_rules.RESOURCES.values())[:1]]))]  # type: ignore[arg-type]
+    assert t.asked == [256, (*tool_rules.RESOURCES.values(), 0)]
+    name, bit = next(iter(tool_rules.RESOURCES.items()))
+    seed = bit, b"\1\2\3\4\5\6"
+    assert said(tool_rules.open_xcp, 1, _seed=seed) == ["f706" + key_of(name, seed[1]).hex()]
+    wrong = ["f706" + "00" * 6, "f70601", "f7ff" + seed[1].hex(), "f700"]
+    assert [said(tool_rules.open_xcp, 0, k, _seed=seed)[0] for k in range(4)] == wrong  # one of twenty is wrong
+    assert [said(tool_rules.open_xcp, k, _seed=seed, keys=False)[0] for k in range(4)] == wrong
+    t = Drawn(1, _seed=seed)
+    tool_rules.open_xcp(t)  # type: ignore[arg-type]
+    assert t.asked == [20]
+
+
+def test_a_hostile_xcp_tool_makes_lists_of_every_kind() -> None:
+    """Draws: given or not, tables, entries, lists; of each entry its place and size; event, prescaler, what is cut."""
+    measured = ["d6", "d5000200", "d400000002", "d30000000002", "d30000000102", "e20000000000"]
+    t = Drawn(0, 1, 1, 1, *(7, 2) * 4, 1, 2, 1)
+    frames = [d.hex() for _, d in tool_rules.make_list(t)]  # type: ignore[arg-type]
+    assert (
+        frames[:6] == measured
+        and frames[6] == frames[7] == "e1ff0101" + (tool_rules.STATE + 28).to_bytes(4, "little").hex()
+    )
+    assert frames[8] == "e20000000100" and frames[11:] == ["e010000001000300", "de010000"]
+    assert t.asked[:5] == [2, 3, 2, 3, 99] and t.asked[5] == (4, 4, 1, 2) and t.asked[-3:] == [2, 4, 3]
+    at = (tool_rules.INPUT + 4 * tool_rules.INPUTS.index("n_r")).to_bytes(4, "little").hex()
+    given = said(tool_rules.make_list, 1, 0, 0, 1, 0, 0, 1)
+    assert given == [
+        "d6",
+        "d5000100",
+        "d400000001",
+        "d30000000001",
+        "e20000000000",
+        f"e1ff0401{at}",
+        "e002000000000100",
+        "de010000",
+    ]
+    cut = said(tool_rules.make_list, 1, 0, 0, 1, 0, 0, 0, 2)
+    assert cut == [*given[:2], *given[3:]]
+    t = Drawn(1, 0, 0, 1, 0, 0, 1)
+    tool_rules.make_list(t)  # type: ignore[arg-type]
+    assert t.asked[3] == (*tool_rules.GIVEN * 3, *tool_rules.INPUTS)
+    t = Drawn(2, 3, 1, 1, 1, 2, 4, 2, 1, 1, 2, 1, 8, 2, 3)
+    tool_rules.change_list(t)  # type: ignore[arg-type]
+    assert t.asked[:-1] == [
+        3, 4, 4, (1, 2, 16, 17, 0xFFFF), (1, 2, 64, 255), (1, 7, 255), (0, 1, 4, 5, 255), 3, 2000, (2, 16, 18, 0), 3, 3,
+        9, 4, 4,
+    ]  # fmt: skip
+    place = (tool_rules.STATE + 1).to_bytes(4, "little").hex()
+    assert [c.hex() for c in t.asked[-1]] == [
+        "d6", "d5000200", "d400020002", "d300020003ff", "e20002000301", f"e1ffff02{place}", "e010020002000108",
+        "de020200", "e3000200", "df000200", "dd03", "db",
+    ]  # fmt: skip
+
+
+def test_a_hostile_xcp_tool_writes_reads_and_switches() -> None:
+    t = Drawn(4, 5, 1, 6, 4, 0, 4, 4, 3, 1, 0, 0x77, 5)
+    given = [d.hex() for _, d in tool_rules.give(t)]  # type: ignore[arg-type]
+    kinds, numbers = t.asked[0], struct.Struct("<2f")
+    assert given == ["00" + numbers.pack(0.0, 70.0)[:7].hex(), "77" + numbers.pack(0.03, 0.0)[:4].hex(), "020000"]
+    assert np.isnan(kinds[0]) and kinds[1:] == (np.inf, 3e38, -3e38, 0.0, 70.0, 0.03, 1.25, 1e-40)
+    assert t.asked[2::3][:3] == [(4, 7, 7, 2)] * 3 and t.asked[9:] == [9, 9, 0xC0, 9]
+    at, base = tool_rules.CALIBRATION, (tool_rules.INPUT, 0x11000000, tool_rules.STATE, tool_rules.CALIBRATION, 0)
+    t = Drawn(3, 0, 1, 0, 1)
+    assert [d.hex() for _, d in tool_rules.calibrate(t)] == [  # type: ignore[arg-type]
+        "f6000001" + (at + 12).to_bytes(4, "little").hex(), "f004" + struct.pack("<f", 4.25).hex(),
+    ]  # fmt: skip
+    assert t.asked == [5, (4.25, 3.5, 5.0, 11.0, t.asked[1][4], np.inf), 2, (3, 3, 3, 3, -1, 4, 5), (1, 2, 2, 2)]
+    assert said(tool_rules.calibrate, 3, 1, 0, 6, 1) == [
+        "f6000000" + (at + 40).to_bytes(4, "little").hex(),
+        "f006" + struct.pack("<d", 3.5)[:6].hex(), "f002" + struct.pack("<d", 3.5)[6:].hex(),
+    ]  # fmt: skip
+    assert said(tool_rules.calibrate, 3, 5, 1, 0, 0)[1] == "f004" + struct.pack("<f", 3e38).hex()
+    t = Drawn(3, 3, 2, 1, 1, 1, 1)
+    tool_rules.pages(t)  # type: ignore[arg-type]
+    assert t.asked[:7] == [(1, 2, 3, 0x83, 0), (0, 0, 0, 1), 3, 2, 2, 2, 2]
+    assert [c.hex() for c in t.asked[-1]] == ["eb830102", "ea0200", "e400010001", "e60100", "f9010000"]
+    t = Drawn(4, 1, 17, 2, 1, 3, 2, 3)
+    assert [d.hex() for _, d in tool_rules.read(t)] == ["f600000111000000", "fa03"]  # type: ignore[arg-type]
+    assert t.asked[:6] == [base, 3, 5000, (1, 7, 8, 255, 0), (1, 100, 1 << 20, (1 << 20) + 1, 0xFFFFFFFF), 6]
+    assert [c.hex() for c in t.asked[6]] == ["f508", "f300000064000000", "fa03"] and t.asked[7] == 4
+    assert said(tool_rules.read, 4, 1, 17, 2, 1, 3, 2, 0, 5) == ["fa05", "f508"]
+    t = Drawn(1, 2)
+    assert [d.hex() for _, d in tool_rules.any_xcp(t)] == ["f2"]  # type: ignore[arg-type]
+    assert t.asked == [(1, 8), 3, (0xF5, 0xF7, 0xF2, 0xFF)]
+    assert said(tool_rules.any_xcp, 0) == ["01"] and said(tool_rules.any_xcp, 1, 1) == ["f7"]  # never a right key
+    flood = [said(tool_rules.flood_xcp, k) for k in range(4)]
+    assert [f[0] for f in flood] == ["f5ff", "fd", "fa04", "0000000000"] and [len(f) for f in flood] == [60] * 4
+
+
+def test_a_hostile_service_tool_asks_for_everything_there_is() -> None:
+    def sent(rule: Any, *draws: int, **more: Any) -> list[tuple[int, str]]:
+        return [(i, d.hex()) for i, d in rule(Drawn(*draws, **more))]
+
+    assert tool_rules.in_frames(5, bytes(7)) == [(5, b"\7" + bytes(7))]
+    long = bytes(range(120))
+    first, *rest = tool_rules.in_frames(5, long)
+    assert first == (5, b"\x10\x78" + long[:6]) and [d[0] for _, d in rest] == [0x20 | n % 16 for n in range(1, 18)]
+    assert b"".join([first[1][2:], *(d[1:] for _, d in rest)]) == long
+    assert tool_rules.in_frames(5, bytes(0x345))[0][1][:2] == b"\x13\x45"
+    assert [sent(tool_rules.session, k, 3)[0] for k in range(4)] == [
+        (0x7DF, "021003"), (0x7DF, "021003"), (0x7DF, "021002"), (0x7DF, "021001")
+    ]  # fmt: skip
+    assert sent(tool_rules.session, 0, 1, 3, session=3) == [(0x7E0, "023e80")]  # kept, eight times of nine
+    assert sent(tool_rules.session, 0, 1, 0, session=3) == [(0x7E0, "021003")]
+    t = Drawn(0, 0, 0, session=3)
+    tool_rules.session(t)  # type: ignore[arg-type]
+    assert t.asked[1:] == [(0x7E0, 0x7E0, 0x7E0, 0x7DF), 9]
+    assert sent(tool_rules.open_uds) == [(0x7E0, "022701")]
+    seed = b"\1\2"
+    assert sent(tool_rules.open_uds, 1, _seed=seed) == [(0x7E0, "0527024b0102")]
+    wrong = [[d for _, d in tool_rules.in_frames(0x7E0, b"\x27\x02" + key)] for key in (bytes(8), bytes(7), seed)]
+    assert [[d for _, d in tool_rules.open_uds(Drawn(0, k, _seed=seed))] for k in range(3)] == wrong  # type: ignore[arg-type]
+    assert [[d for _, d in tool_rules.open_uds(Drawn(k, _seed=seed, keys=False))] for k in range(3)] == wrong  # type: ignore[arg-type]
+    t = Drawn(1, _seed=seed)
+    tool_rules.open_uds(t)  # type: ignore[arg-type]
+    assert t.asked == [20]
+    assert [sent(tool_rules.silence, k) for k in range(4)] == [
+        [(0x7E0, data), (0x7E0, "023e80")] for data in ("03280101", "03280001", "028502", "028501")
+    ]
+    assert [sent(tool_rules.reset, k, k) for k in (0, 1)] == [[(0x7E0, "021101")], [(0x7DF, "021103")]]
+    assert sent(tool_rules.reset, 0, 2) == [(0x7E0, "021181")]
+    t = Drawn(2, 1)
+    assert [d.hex() for _, d in tool_rules.routine(t)] == ["04310302" + "02"] and t.asked == [3, 3]  # type: ignore[arg-type]
+
+
+def test_a_hostile_service_tool_loads_files_and_sends_pieces() -> None:
+    t = Drawn(2, 4, 1)
+    whole = [b"\x34\0\x44" + struct.pack(">II", 0, 1 << 16), b"\x36\1" + bytes(254), b"\x36\2" + bytes(46), b"\x37"]
+    assert tool_rules.load(t) == [f for request in whole for f in tool_rules.in_frames(0x7E0, request)]  # type: ignore[arg-type]
+    assert t.asked == [(4, 10, 300), (300, 300, 300, 0, 1 << 16, (1 << 16) + 1), 3]
+    cut = tool_rules.load(Drawn(0, 0, 0, 1))  # type: ignore[arg-type]
+    assert cut == [*tool_rules.in_frames(0x7E0, b"\x34\0\x44" + struct.pack(">II", 0, 4)), (0x7E0, b"\1\x37")]
+    t = Drawn(5, 1, 3, 2)
+    tool_rules.trouble(t)  # type: ignore[arg-type]
+    assert t.asked[:6] == [
+        12, (0, 4), (b"\x98", b"\x99"), (0, 20), (b"\x20\x00", b"\xf1\xa0", b"\xf1\x97", b"\xf1\x86"), (1, 3, 16, 17)
+    ]  # fmt: skip
+    assert [c.hex() for c in t.asked[6]] == ["14ffffff", "1905", "19041a0187ff", "2ef199", "22" + "f186" * 16]
+    t = Drawn(1, 9, 2, 8, 3, 0, 7, 0, 0, 0)
+    (ident, data), *more = tool_rules.pieces(t)  # type: ignore[arg-type]
+    names = ("first", "next", "flow", "long", "single", "other")
+    assert t.asked[:12] == [
+        (0, 7, 8, 100, 1024, 1025, 4095), (0, 6), 16, (0, 7), 4, 9, (0, 5, 0x7F, 0xF1, 0x80), (5000, 0xFFFFFFFF), 16,
+        (0, 7), (0, 8), 4,
+    ]  # fmt: skip
+    assert t.asked[12:14] == [(0x7E0, 0x7E0, 0x7DF), names] and (ident, data) == (0x7E0, b"\x10\7") and more == []
+    made = [tool_rules.pieces(Drawn(3, 9, 2, 8, 3, 1, 5, 0, 2, k))[0] for k in range(6)]  # type: ignore[arg-type]
+    assert made == [(0x7DF, bytes.fromhex(d)) for d in ("1064", "29", "3208f1", "1000ffffffff", "05", "")]
+    t = Drawn(1, 0)
+    assert tool_rules.any_uds(t) == [(0x7E0, b"\1\x27")] and t.asked == [(1, 12), (0x22, 0x27, 1), (0x7E0, 0x7DF)]  # type: ignore[arg-type]
+    flood = [tool_rules.flood_uds(Drawn(k)) for k in range(3)]  # type: ignore[arg-type]
+    assert [f[0] for f in flood] == [
+        (0x7E0, b"\x10\x64\x2e\xf1\x99\0\0\0"),
+        (0x7DF, b"\2\x3e\0"),
+        (0x7DF, b"\3\x22\xf1\xa0"),
+    ]
+    assert [len(f) for f in flood] == [60] * 3
+
+
+def test_rules_come_as_often_as_their_weight_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    rules = {(lambda t, k=k: [k]): weight for k, weight in enumerate((2, 1, 3))}
+    monkeypatch.setattr(tool_rules, "RULES", rules)
+    asked: list[int] = []
+    numbers = iter(range(6))
+    t: Any = SimpleNamespace(rng=SimpleNamespace(integers=lambda n: asked.append(n) or next(numbers)))
+    assert [tool_rules.rules_of(t) for _ in range(6)] == [[0], [0], [1], [2], [2], [2]] and asked == [6] * 6
