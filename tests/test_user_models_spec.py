@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import scipy
 from numba.core.compiler import run_frontend
+from scipy.stats import qmc
 
 from hil.logs.notes import Note
 from plant.model import Learned
@@ -26,7 +27,7 @@ from vaneloop.identification.results import StageDiagnosis
 from vaneloop.identification.selection.diagnosis import diagnose_stage
 from vaneloop.identification.settings import COARSE_STOPS, LEVEL_SPREAD
 from vaneloop.identification.subsystem import Array
-from vaneloop.identification.user_models import experiment, terms
+from vaneloop.identification.user_models import bound_system, by_log, experiment, terms
 from vaneloop.identification.user_models.bound_system import BoundSystem, steps_seen
 from vaneloop.identification.user_models.by_log import ByLog, Logs, _loaded, as_given, bind, parameter_warnings
 from vaneloop.identification.user_models.codegen import try_law
@@ -2008,3 +2009,98 @@ def test_what_a_simulation_is_told_of_its_surfaces() -> None:
     curve = terms.Curve("output adds", 0, terms.INPUT, "u", 0.0, 1.0, lambda v: v)
     assert [[c for c, _ in part] for part in terms.apart([(curve, small[0]), *both])] == [[curve], [first, other]]
     assert other.value(lambda number, name: np.array([number])).tolist() == [[terms.INPUT + 1], [terms.COLUMN]]
+
+
+# ---- where a fit of unknown parameters begins ------------------------------------------------------------------------
+
+
+def test_a_fit_begins_at_the_draws_that_come_nearest_plainly_or_but_for_gain_and_offset() -> None:
+    t = np.linspace(0.0, 3.0, 50)
+    measured = np.array([2.0 * np.exp(-0.7 * t) + 0.3, np.full(50, np.nan)])
+    measured[1, ::2] = np.sin(1.3 * t[::2])
+    measured[0, 7] = np.nan
+    values, free, size = np.array([5.0, 1.0, 0.0]), [1, 2], np.array([2.0, 4.0])
+    first, low, high = np.array([0.5, 0.0]), np.array([-np.inf, -0.9]), np.array([4.0, np.inf])
+    asked: list[int] = []
+
+    def model(thetas: Any) -> Any:
+        k, w = thetas[:, 1:2], thetas[:, 2:3]
+        out = np.stack([thetas[:, :1] * np.exp(-k * t), np.sin(w * t) + 0.1 * k], axis=1)
+        out[k[:, 0] > 6.0] = 1e9  # these leave all bounds
+        return out
+
+    own: Any = SimpleNamespace(
+        measured=measured, runner=SimpleNamespace(far=1e6), run=lambda th: asked.append(len(th)) or model(th)
+    )
+    scale = np.array([0.5, 0.8])
+    got = BoundSystem._drawn(own, values, free, size, first, low, high, scale)
+    power = 4 + 2
+    unit = qmc.Sobol(2, seed=0).random_base2(power)
+    one = np.minimum(0.5 * bound_system.FACTOR ** (2.0 * unit[:, 0] - 1.0), 4.0)  # about the user's own value
+    z = np.column_stack([one, np.maximum(2.0 * unit[:, 1] - 1.0, -0.9)])  # of a value of 0 between both signs
+    plain, bent = [], []
+    for row in z:
+        theta = values.copy()
+        theta[free] = row * size
+        m = model(theta[None])[0]
+        if np.abs(m).max() >= 1e6:
+            plain.append(np.inf)
+            bent.append(np.inf)
+            continue
+        sums = [0.0, 0.0]
+        for y, said, s in zip(measured, m, scale, strict=True):
+            there = np.isfinite(y)
+            sums[0] += np.mean(((said - y)[there] / s) ** 2)
+            line = np.polyfit(said[there], y[there], 1)
+            sums[1] += np.mean(((y - np.polyval(line, said))[there] / s) ** 2)
+        plain.append(sums[0])
+        bent.append(sums[1])
+    half = bound_system.FITS_FROM // 2
+    best = dict.fromkeys([*np.argsort(plain)[:half].tolist(), *np.argsort(bent)[:half].tolist()])
+    wanted = [z[i] for i in best if np.isfinite(plain[i])]
+    assert len(got) == len(wanted) > half and asked == [32, 32]
+    for a, b in zip(got, wanted, strict=True):
+        np.testing.assert_allclose(a, b)
+    own.run = lambda th: np.full((len(th), 2, 50), 1e9)
+    assert BoundSystem._drawn(own, values, free, size, first, low, high, scale) == []
+
+
+@pytest.mark.parametrize("times", [0.0, 0.1, 0.25, 0.5, 1.0, 2.0, -0.1, -0.25, -0.5, -1.0, -2.0])
+@pytest.mark.parametrize("own_size", [3.0, None])
+def test_an_unknown_start_is_set_to_a_round_size_of_the_outputs(times: float, own_size: float | None) -> None:
+    measured = np.array([[4.0, -8.0, np.nan], [1.0, 2.0, 3.0]])
+    size = own_size or 8.0  # else the largest value that was measured
+    course = np.where(np.isfinite(measured), measured, 99.0)
+    own: Any = SimpleNamespace(
+        measured=measured, start_sizes=[None, own_size], system=SimpleNamespace(parameters=["k"]),
+        run=lambda th: course + (th[:, 2:3, None] - 5.0 - size * times),
+    )  # fmt: skip
+    theta = np.array([1.0, 7.0, 5.0])
+    BoundSystem._scan_starts(own, theta, [2])
+    assert theta.tolist() == [1.0, 7.0, pytest.approx(5.0 + size * times)]
+
+
+def test_what_laws_do_to_each_log_and_parameters_that_are_not_needed_any_more_are_noted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(by_log, "_loaded", lambda *of: ["loaded"])
+    monkeypatch.setattr(by_log, "parameter_warnings", lambda *of: ["again", "warned"])
+    ps = [
+        Parameter("k", 1.0, "N", 0.0, 9.0, 5.0), Parameter("zero", 1.0, "N", 0.0, 9.0, 5.0),
+        Parameter("fixed", 1.0, "N", 0.0, 9.0), Parameter("signed", 1.0, "N", -9.0, 9.0, 5.0),
+        Parameter("never", 0.0, "N", 0.0, 9.0, 5.0),
+    ]  # fmt: skip
+    limit = by_log.NO_HELP
+    own: Any = SimpleNamespace(
+        notes=["before"], ablation={"lag": {"a": limit, "b": limit + 1e-6, "c": 0.98, "d": 1.234}},
+        logs=SimpleNamespace(fitted=SimpleNamespace(stage=SimpleNamespace(parameters=ps))),
+        d=SimpleNamespace(final=SimpleNamespace(effects=("lag", "play"), theta=np.array([2.0, 0.0, 0.0, 0.0, 0.0])),
+                          base=SimpleNamespace(theta=np.array([1.0, 1.2345678, 1.0, 1.0, 0.0])), notes=["again"]),
+    )  # fmt: skip
+    by_log.ByLog._remark(own, None)  # type: ignore[arg-type]
+    assert own.notes == [
+        "before", f"lag hardly helps on b: error with it over error without it is {limit:.2f}",
+        "lag does not help on c: error with it over error without it is 0.98",
+        "lag does not help on d: error with it over error without it is 1.23",
+        "zero: not needed any more, set to 0 (it was 1.235 N while lag, play was missing)", "loaded", "again", "warned",
+    ]  # fmt: skip
