@@ -4,6 +4,7 @@ the step that ranks them, what confirms them, and the Python file that says one.
 
 from __future__ import annotations
 
+import inspect
 import math
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
@@ -21,7 +22,14 @@ from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import diagnose_stage
 from vaneloop.identification.settings import LEAST_FALL, LEAST_OF_NOISE, LEVEL_SPREAD, NATS
 from vaneloop.identification.subsystem import Array
-from vaneloop.identification.unmodelled import fitted_candidate, learned_law, problem, spectral_lines
+from vaneloop.identification.unmodelled import (
+    closed_form_fits,
+    curve_choice,
+    fitted_candidate,
+    learned_law,
+    problem,
+    spectral_lines,
+)
 from vaneloop.identification.unmodelled.closed_form_fits import Product, goes_on
 from vaneloop.identification.unmodelled.curve_candidates import (
     Candidate,
@@ -914,3 +922,135 @@ def test_a_band_goes_about_a_formula_as_far_as_the_parameters_leave_it(
 def test_what_grounds_give_the_search_for_curves() -> None:
     own = UserModelCandidates
     assert (own.points, own.jumps, own.surfaces) == (FINE, True, True)
+
+
+HOWS = {
+    "parameter times": "k is multiplied by 1 + {}", "input adds": "{} is added to k",
+    "input times": "k is multiplied by 1 + {}", "state adds": "{} is taken off the derivative of k",
+    "force adds": "{} is added to the force", "output adds": "{} is added to the reading k",
+    "output times": "the reading k is multiplied by 1 + {}", "adds": "{} is added to k",
+    "times": "k is multiplied by 1 + {}",
+}  # fmt: skip
+
+
+def a_law(**more: Any) -> LearnedLaw:
+    x = np.linspace(-1.0, 2.0, 5)
+    given: dict[str, Any] = {
+        "name": "k.curve_of_u", "how": "adds", "at": "k", "of": "u", "unit": "N", "of_unit": "mm", "x": x, "y": x,
+        "low": x, "high": x, "edges": x, "visited": x, "error_before": 2.0, "error_after": 1.0, "knots": x,
+    }  # fmt: skip
+    return LearnedLaw(**given | more)
+
+
+def test_a_learned_law_in_words() -> None:
+    for how, said in HOWS.items():
+        assert a_law(how=how).sentence() == said.format("a function of u")
+    line = Formula("line", "2 u", {"a": 2.0}, 1.0, 1.0, "k.gain", 0.0)
+    root = Formula("root", "3 sqrt(u)", {"a": 3.0}, 1.0, 1.0, "", 0.0)
+    assert a_law(formulas=[line, root]).sentence() == "a function of u is added to k, near 2 u (k.gain of the library)"
+    assert a_law(formulas=[root], spoken=root).sentence() == "a function of u is added to k, 3 sqrt(u)"
+    constant = a_law(spoken=Formula("constant", "5 N", {"a": 5.0}, 1.0, 1.0, "", 0.0))
+    assert constant.constant and not a_law(spoken=root).constant
+    assert constant.sentence() == "a constant is added to k, 5 N"
+    stops = a_law(of="stops_of_u", formulas=[root])
+    assert stops.sentence() == "a hysteresis of u is added to k, with the virgin curve near 3 sqrt(u)"
+    assert a_law(of="u_lagged_by_20_ms").sentence() == "a function of u (lagged by 0.02 s) is added to k"
+    timed = a_law(of="time_every_1500_ms", of_unit="s", period=1.5)
+    assert timed.sentence() == "a function of the time within each 1.5 s is added to k" and timed.channel == "time"
+    assert a_law(period=0.25, of_unit="-").sentence() == "a function of u within each 0.25 is added to k"
+    assert a_law().channel == a_law().of_what == "u" and a_law().more() == {} and a_law().axis() is None
+
+
+def test_where_a_law_holds_in_words() -> None:
+    root = Formula("root", "3 sqrt(u)", {"a": 3.0}, 1.0, 1.0, "", 0.0)
+    assert a_law().range_note() == (
+        "k.curve_of_u: u has been in [-1, 2] mm; the law file has the curve; beyond, it stays as at its end"
+    )
+    assert a_law(spoken=root, reach=(-3.0, 4.5)).range_note() == (
+        "k.curve_of_u: u has been in [-1, 2] mm; the law file has the formula, which does as well as the curve; it goes "
+        "on to [-3, 4.5] mm, and stays as there beyond"
+    )
+    assert a_law(of_unit="-").range_note().startswith("k.curve_of_u: u has been in [-1, 2]; the")
+    assert a_law(period=2.0).range_note() == "k.curve_of_u: the law file has the curve"
+    same, every = a_law(), a_law(of="time_every_1500_ms", period=1.5)
+    assert same.of_the_kind_of(a_law(name="other")) and not same.of_the_kind_of(a_law(at="m"))
+    assert not same.of_the_kind_of(a_law(how="times")) and not same.of_the_kind_of(a_law(of="v"))
+    assert every.of_the_kind_of(a_law(of="time_every_3000_ms", period=3.0))
+
+
+def test_rows_that_may_have_a_line_are_errors_their_rates_and_their_products() -> None:
+    t = [0.1 * np.arange(30), 0.2 * np.arange(20)]
+    errors = [white(k, 2, len(x)) for k, x in enumerate(t)]
+    signals = [np.array([1.0 + 3.0 * x + np.sin(x)]) for x in t]
+    rows = spectral_lines._rows(t, errors, signals)
+    each = spectral_lines.LINE_DERIVATIVES + 1
+    assert len(rows) == 2 * each * 2 and all(len(r) == 2 for r in rows)
+    for log, x in enumerate(t):
+        at = 0
+        for j in range(2):
+            e = errors[log][j]
+            for _ in range(each):
+                s = signals[log][0] - np.polyval(np.polyfit(x, signals[log][0], 1), x)
+                for factor in (1.0, s):
+                    np.testing.assert_allclose(rows[at][log], e * factor, atol=1e-9)
+                    at += 1
+                e = np.gradient(e, x)
+    alone = spectral_lines._rows(t[:1], [errors[0][:1]], [np.zeros((0, 30))])
+    assert len(alone) == each and alone[0][0].tolist() == errors[0][0].tolist()
+    where = np.arange(400) % 40
+    power = spectral_lines._power(where, 3.0 + np.cos(2.0 * np.pi * where / 8.0), 40)
+    assert int(np.argmax(power)) == 5 * spectral_lines.LINES_EACH  # five cycles from end to end
+    assert (
+        power.max() == pytest.approx((0.5 * 400.0) ** 2 / 200.0)
+        and spectral_lines._power(where, np.ones(400), 40).max() == 0
+    )
+
+
+def test_pairs_of_formulas_are_the_likeliest_of_both_factors(monkeypatch: pytest.MonkeyPatch) -> None:
+    x, z = np.linspace(-1.0, 1.0, 200), np.linspace(0.5, 2.0, 200)
+    c: Any = SimpleNamespace(axes=[(Quantity("u", "V", INPUT, x), None), (Quantity("w", "degC", INPUT, z), None)])
+    asked: list[tuple[str, float]] = []
+    share = {"line": 1e-9, "cube": 0.02, "root": 0.3, "Arrhenius": 0.01, "exponential": 5.0}
+
+    def begin(form: Any, some: Array, values: Array, free: Any) -> Any:
+        asked.append((form.name, float(some[0])))
+        assert values.tolist() == (2.0 * some).tolist() and len(free) == 0
+        return (np.array([1.0]), share[form.name]) if form.name in share else None
+
+    monkeypatch.setattr(closed_form_fits, "begin", begin)
+    pairs = closed_form_fits._likely(c, (x, z), (lambda v: 2.0 * v, lambda v: 2.0 * v))  # type: ignore[arg-type]
+    names = {f.name for f in FORMS}
+    assert {n for n, first in asked if first < 0.0} == names - {"constant", "Arrhenius"}  # no temperature
+    assert {n for n, first in asked if first > 0.0} == names - {"constant"}
+    assert sorted({first for _, first in asked}) == pytest.approx([np.quantile(x, 0.005), np.quantile(z, 0.005)])
+
+    def worth(name: str) -> float:
+        form = next(f for f in FORMS if f.name == name)
+        return float(np.log(max(share[name], closed_form_fits.FORMS_ALIKE)) + 0.3 * form.complexity)
+
+    most = closed_form_fits.PRODUCT_FORMS
+    good = [[n for n in share if share[n] < closed_form_fits.FORM_SHAPED and (n != "Arrhenius" or k)] for k in (0, 1)]
+    kept = [sorted(g, key=worth)[:most] for g in good]
+    wanted = sorted(((worth(a) + worth(b), a, b) for a in kept[0] for b in kept[1]), key=lambda w: w[0])
+    assert [(one[0].name, other[0].name) for one, other in pairs] == [(a, b) for _, a, b in wanted]
+
+
+def test_formulas_of_a_curve_are_tried_with_its_mean_and_without_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[bool] = []
+    strict, loose = [("f", "one"), ("g", "two")], [("g", "two"), ("h", "three")]
+
+    def fitted(ground: Any, tried: Any, loose: bool = False) -> Any:
+        asked.append(loose)
+        return loose_found if loose else strict
+
+    loose_found: list[Any] = loose
+    monkeypatch.setattr(curve_choice, "fitted_formulas", fitted)
+    tried: Any = SimpleNamespace(loose=None)
+    assert curve_choice.with_and_without_mean(None, tried) == ["one", "two", "three"] and asked == [False, True]  # type: ignore[arg-type, comparison-overlap]
+    assert curve_choice.with_and_without_mean(None, tried) == ["one", "two", "three"] and asked[2:] == [False]  # type: ignore[arg-type, comparison-overlap]
+    loose_found, none = [], SimpleNamespace(loose=None)
+    assert curve_choice.with_and_without_mean(None, none) == ["one", "two"] and none.loose == ["one", "two"]  # type: ignore[arg-type, comparison-overlap]
+    out = SimpleNamespace(decisions=None)
+    own: Any = SimpleNamespace(_searched=lambda: out, decisions=["a", "b"])
+    assert CurveSearch.learned(own) is out and out.decisions == ["a", "b"]  # type: ignore[comparison-overlap]
+    assert inspect.signature(CurveProblem).parameters["speaks"].default is True
