@@ -618,7 +618,7 @@ def test_where_a_law_holds_is_said() -> None:
     formula = Formula("line", "2 u", {"a": 2.0}, 1.0, 2)
     spoken = replace(curve, spoken=formula, reach=(-4.0, 4.0))
     assert spoken.range_note() == (
-        "y.curve_of_u: u has been in [-2, 2] V; the law file has the formula, which does as well as the curve; it goes "
+        "y.curve_of_u: u has been in [-2, 2] V; the law file has the formula, which does as well as the curve; it "
         "on to [-4, 4] V, and stays as there beyond"
     )
     always = replace(curve, spoken=Formula("constant", "3", {"a": 3.0}, 1.0, 1))
@@ -967,8 +967,8 @@ def test_where_a_law_holds_in_words() -> None:
         "k.curve_of_u: u has been in [-1, 2] mm; the law file has the curve; beyond, it stays as at its end"
     )
     assert a_law(spoken=root, reach=(-3.0, 4.5)).range_note() == (
-        "k.curve_of_u: u has been in [-1, 2] mm; the law file has the formula, which does as well as the curve; it goes "
-        "on to [-3, 4.5] mm, and stays as there beyond"
+        "k.curve_of_u: u has been in [-1, 2] mm; the law file has the formula, which does as well as the curve; it "
+        "goes on to [-3, 4.5] mm, and stays as there beyond"
     )
     assert a_law(of_unit="-").range_note().startswith("k.curve_of_u: u has been in [-1, 2]; the")
     assert a_law(period=2.0).range_note() == "k.curve_of_u: the law file has the curve"

@@ -1562,7 +1562,10 @@ def test_a_model_is_judged_where_what_drives_it_is_known() -> None:
     known, notes = parts._driven(
         t, {"u": Channel(slow, slow), "w": Channel(late, late), "c": Channel(slow[:1], slow[:1])}
     )
-    assert known == pytest.approx([0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]) and [n.split(":")[0] for n in notes] == ["u", "w"]
+    assert known == pytest.approx([0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0]) and [n.split(":")[0] for n in notes] == [
+        "u",
+        "w",
+    ]
     assert notes[0] == "u: logged from 0.31 to 0.71 s: what is measured outside does not count"
     assert [(n.kind, n.of, n.number) for n in notes] == [("cut", "u", 1), ("cut", "w", 4)]
     ends, _ = parts._driven(t, {"u": Channel(slow - 0.2, slow)})
