@@ -17,11 +17,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.logs import Channel, Log, LogError, csv_format, offered, plausible, read_log, source, write_log
+from hil.logs import Channel, Log, LogError, csv_format, offered, plausible, read_log, source, transport, write_log
+from hil.logs import guess as guess_of
 from hil.logs import joined as joined_rows
 from hil.logs import log as logs
 from hil.logs.channels import Channels, NoChannel, raster
 from hil.logs.dates import OddRow, from_dates
+from hil.logs.formula import formula_of
+from hil.logs.frames import Frames
 from hil.logs.guess import feed_forward
 from hil.logs.joined import Joined, joined, seems_joined
 from hil.logs.mapping import Bench, read_mapping, write_mapping
@@ -1373,3 +1376,115 @@ def test_time_from_1970_or_far_away_is_counted_from_the_start() -> None:
     ]
     assert shifted(-far - 10.0)[0] == [0.0, 1.0, 2.0]
     logs._shift({}, [], "1970")
+
+
+# ---- rows as long as their header ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_rows_have_the_header_s_cells_or_are_counted(quote: str) -> None:
+    """Of four cells, three of which must be there: longer rows whose last cells are empty, shorter ones, empty ones."""
+    rows = ["1;2;3;4", "1;2;3", "1;2", "1;2;3;4;;", "1;2;3;4;5", ";", "", "1;2;3;4; ", "5;6;7;8"]
+    text = "".join(f"{quote}{r.replace(';', f'{quote};{quote}')}{quote}\n" for r in rows).encode()
+    out, counted = csv_format._fitting(text, ";", 3, 4)
+    assert counted.tolist() == [0, 0, 2, 0, 5, 0, 0, 0, 0] and type(counted[0]) is np.int64
+    kept = [["1", "2", "3", "4"], ["1", "2", "3", ""], [""] * 4, ["1", "2", "3", "4"], [""] * 4, [""] * 4, [""] * 4,
+            ["1", "2", "3", "4"], ["5", "6", "7", "8"]]  # fmt: skip
+    assert [line.split(";") for line in out.decode().splitlines()] == kept
+    windows, _ = csv_format._fitting(b"1;2\r\n3\r\n", ";", 2, 2)
+    assert windows == b"1;2\n;\n" and csv_format._fitting(b"1;2", ";", 2, 2)[1].tolist() == [0]
+
+
+# ---- whether signals can be what they are guessed to be --------------------------------------------------------------
+
+
+def test_two_signals_go_together_where_both_move() -> None:
+    a = np.arange(40.0)
+    assert (
+        guess_of._together(a, 3.0 * a, 39.0, 117.0) == pytest.approx(1.0)
+        and guess_of._together(a, -a, 1.0, 1.0) == -1.0
+    )
+    assert guess_of._together(a, a, 39.1, 1.0) == guess_of._together(a, a, 1.0, 39.1) == 0.0
+    assert guess_of._together(a[:19], a[:19], 1.0, 1.0) == 0.0 and guess_of._together(a[:20], a[:20], 1.0, 1.0) > 0.99
+
+
+def test_a_stroke_off_its_schedule_has_another_zero_or_unit() -> None:
+    at, curve = guess_of.mean_stroke({})
+    speed = np.linspace(at[0], at[-1], 400)
+    planned, off = np.interp(speed, at, curve), 0.18 * np.ptp(curve)
+    assert guess_of._off_schedule(planned, speed, {}) == "" == guess_of._off_schedule(planned + 0.99 * off, speed, {})
+    assert guess_of._off_schedule(planned + 1.02 * off, speed, {}) == (
+        f"it is {1.02 * off:.2g} mm away, half of the time, from what the schedule says"
+    )
+    middle = planned.mean()
+    for times, said in ((1.49, ""), (1.52, "1.5"), (0.68, ""), (0.65, "0.65")):
+        found = guess_of._off_schedule(middle + times * (planned - middle), speed, {})
+        assert found == (f"it moves {said} times as far as the schedule says" if said else "")
+    noise = np.random.default_rng(1).standard_normal(400)
+    assert guess_of._off_schedule(100.0 + 20.0 * noise, speed, {}) == ""  # follows no schedule at all
+    still = np.full(400, speed[0])
+    assert guess_of._off_schedule(planned + 30.0, still, {}) == ""  # nothing was asked of it
+
+
+def test_a_vane_that_follows_another_s_schedule_is_that_one() -> None:
+    t = np.arange(200) * 0.1
+    speed = 65.0 + 30.0 * np.sin(0.4 * t)
+    planned = guess_of.planned_angles(speed, {})
+    channels = {"n_r": (t, speed), "vgv1": (t, planned["vigv"])}
+    assert guess_of._other_vane("vgv1", channels, {}) == "vigv"
+    assert guess_of._other_vane("vgv1", {**channels, "vgv1": (t, planned["vgv1"] + 1.9)}, {}) == ""
+    assert (
+        guess_of._other_vane("vgv2", channels, {}) == "" == guess_of._other_vane("vgv1", {"vgv1": channels["vgv1"]}, {})
+    )
+    demand = {"n_dem": channels["n_r"], "vgv1": channels["vgv1"]}
+    assert guess_of._other_vane("vgv1", demand, {}) == "vigv"
+    short = {"n_r": (t[:20], speed[:20]), "vgv1": channels["vgv1"]}
+    assert guess_of._other_vane("vgv1", short, {}) == ""
+    quiet = {"n_r": (t, np.full(200, 60.0)), "vgv1": (t, np.full(200, 40.0))}
+    assert guess_of._other_vane("vgv1", quiet, {}) == ""
+    assert guess_of._other_vane("vgv7", {**channels, "vgv7": channels["vgv1"]}, {}) == ""  # no such row
+
+
+# ---- messages in pieces ----------------------------------------------------------------------------------------------
+
+
+def pieces_of(*frames: str, bus: int = 0) -> Frames:
+    data = [bytes.fromhex(f) for f in frames]
+    rows = np.zeros((len(data), 64), np.uint8)
+    for k, d in enumerate(data):
+        rows[k, : len(d)] = np.frombuffer(d, np.uint8)
+    n, length = len(data), np.array([len(d) for d in data], np.uint8)
+    return Frames(np.arange(float(n)), np.full(n, 0x7E8, np.uint32), np.full(n, bus, np.int32), length, rows)
+
+
+@pytest.mark.parametrize(
+    ("frames", "whole", "broken", "took"),
+    [
+        (["03aabbcc"], ["aabbcc"], 0, 1), (["04aabbcc"], [], 0, 0), (["00"], [], 0, 0), ([""], [], 0, 0),
+        (["07" + "11" * 7], ["11" * 7], 0, 1), (["0009" + "22" * 10], ["22" * 9], 0, 1),  # CAN FD: its length in byte 1
+        (["1009" + "33" * 6, "21444444"], ["33" * 6 + "444444"], 0, 2),
+        (["1009" + "33" * 6, "300000", "21444444"], ["33" * 6 + "444444"], 0, 2),  # flow control is passed over
+        (["1009" + "33" * 6, "22444444"], [], 1, 0), (["1009" + "33" * 6], [], 1, 0), (["21444444"], [], 0, 0),
+        (["1009" + "33" * 6, "01aa", "21444444"], ["aa"], 1, 1), (["1006" + "33" * 6, "21"], [], 0, 0),
+        (["1000" + "00000009" + "55" * 2, "21" + "66" * 7], ["55" * 2 + "66" * 7], 0, 2),  # the length in four bytes
+        (["1fff" + "00" * 6], [], 1, 0), (["1000" + "00001000" + "0000"], [], 0, 0),  # 4095 bytes at most
+        (["1075" + "77" * 6, *(f"2{k % 16:x}" + f"{k:02x}" * 7 for k in range(1, 17))],
+         ["77" * 6 + "".join(f"{k:02x}" * 7 for k in range(1, 17))[: 2 * 111]], 0, 17),
+    ],
+)  # fmt: skip
+def test_pieces_of_iso_tp_become_messages(frames: list[str], whole: list[str], broken: int, took: int) -> None:
+    of = pieces_of(*frames)
+    found = transport._iso_tp(of, np.arange(len(frames)))
+    assert [d.hex() for d in found.data] == whole and (found.broken, found.frames) == (broken, took)
+    assert found.ident == [0x7E8] * len(whole)
+    if took > 1:  # a message has the time of its last frame
+        assert found.t == [len(frames) - 1.0]
+
+
+def test_values_are_chosen_sample_by_sample_and_modes_hold() -> None:
+    t = np.arange(4.0)
+    channels = {"m": Channel(t, np.array([0.0, 1.0, 2.0, 2.0])), "f": Channel(t + 0.5, np.array([5.0, 6.0, 7.0, 8.0]))}
+    made = formula_of("where(m > 0.5, m, 9)").made(channels)
+    assert made.values.tolist() == [9.0, 1.0, 2.0, 2.0]
+    chosen = formula_of("where(m > 0.5, m, 9) + 0 * f").made(channels)
+    assert set(chosen.values) <= {9.0, 1.0, 2.0}  # whole numbers are held, and no halves are made of them
