@@ -1611,7 +1611,7 @@ def test_rows_without_time_stand_in_an_order_of_their_numbers_alone() -> None:
         found.append(record.columns["u"].tolist())
         assert record.columns["y"].tolist() == [10.0 * v for v in found[-1]] and record.t.tolist() == list(range(5))
         assert said == ["t.csv: n", "t.csv: rows: 1 without an input, or without any output: left out"]
-        assert not record.ordered and list(record.notes) == said
+        assert not record.ordered and list(record.notes) == said and record.begin == 0.0
     assert found[0] == found[1] != sorted(found[0]) and sorted(found[0]) == [1.0, 2.0, 3.0, 4.0, 7.0]
 
 
@@ -1755,3 +1755,93 @@ def test_an_extended_model_is_explained_at_its_floor(monkeypatch: pytest.MonkeyP
     }
     assert (said["model"], said["verdict"]) == ("m.toml", "missing")
     assert answer([one], "worse").to_dict()["stages"][0]["verdict"] == "missing"  # type: ignore[index]
+
+
+def test_an_experiment_begins_with_the_diagnosis_that_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[Any] = []
+
+    def found(by_log: Any) -> Any:
+        d: Any = SimpleNamespace(stages=["first", "second"], notes=[])
+        return search.Diagnosed("bound", d, "a.csv", by_log)  # type: ignore[arg-type]
+
+    of_machine, of_system = found(None), found(SimpleNamespace(logs=SimpleNamespace(fitted="fitted")))
+    monkeypatch.setattr(search, "recommend", lambda d, progress, bound: said.append((d, progress, bound)) or "run")
+    monkeypatch.setattr(search, "best_run", lambda *of: said.append(of[:3]) or of[3](0.5) or "own run")
+    monkeypatch.setattr(search, "chain_for", lambda *of: ("chain", of))
+    monkeypatch.setattr(search, "diagnosed", lambda chain, name: said.append((chain, name)) or of_machine)
+    monkeypatch.setattr(
+        search, "diagnose", lambda *of, **how: said.append((of, how)) or how["progress"](1.0) or of_system
+    )
+    told: list[float] = []
+    answer: Any = search.experiment("a.csv", of_machine, progress=told.append)
+    assert answer.recommended == "run" and answer.diagnosed is of_machine and answer.log == "a.csv"
+    assert said == [(of_machine.diagnosis, told.append, "bound")]
+    machine = Machine()
+    said.clear()
+    search.experiment("a.csv", machine, fit="0:5", test="5:9")
+    assert said[0] == ("chain", ("a.csv", machine, "0:5", "5:9")) and len(said) == 2
+    search.experiment("a.csv")
+    assert isinstance(said[2][1][1], Machine)
+    pump, limits, added = system(), search.Limits(), Model()
+    said.clear()
+    own: Any = search.experiment("a.csv", pump, fit="0:5", added=added, limits=limits, progress=told.append)
+    ((of, how), run) = said
+    assert of == ("a.csv", pump) and (how["fit"], how["test"], how["added"]) == ("0:5", (), added)
+    assert run == ("fitted", "first", limits) and own.recommended == "own run" and told == pytest.approx([0.3, 0.65])
+    search.experiment("a.csv", of_system)
+    assert said[-1] == ("fitted", "first", search.Limits())
+
+
+def test_a_machine_is_extended_by_effects_and_law_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    more: Any = SimpleNamespace(curves={"mine": 1})
+    monkeypatch.setattr(
+        search,
+        "with_law_files",
+        lambda effects, machine: (asked.append((effects, machine)), (["valve_lag", "mine"], more))[1],
+    )
+    monkeypatch.setattr(search, "chain_for", lambda log, machine, fit, test: ((machine, fit, test), log))
+    monkeypatch.setattr(search, "extended", lambda *of: of)
+    machine = Machine(model=Model(effects={"lvdt_bias": {"bias": 0.1}}))
+    chain, wanted, model, name = search.extend("a.csv", ["valve_lag", "m.toml"], machine, fit="0:5", test="5:9")  # type: ignore[misc]
+    assert asked[0] == (["valve_lag", "m.toml"], machine) and (wanted, model, name) == (
+        ["valve_lag", "mine"],
+        more,
+        "a.csv",
+    )
+    bare, fit, test = chain  # type: ignore[misc]
+    assert (
+        bare.model is None
+        and (bare.tables, bare.strategy, bare.table) == (None, None, None)
+        and (fit, test) == ("0:5", "5:9")
+    )  # type: ignore[has-type]
+    search.extend("a.csv", "valve_lag")
+    assert asked[1][0] == ["valve_lag"] and isinstance(asked[1][1], Machine)
+    monkeypatch.setattr(search, "with_law_files", lambda effects, machine: (["valve_leg"], more))
+    with pytest.raises(InputError, match="^--effect 'valve_leg' is not in the library; probably 'valve_lag' is meant"):
+        search.extend("a.csv", ["valve_leg"])
+    with pytest.raises(InputError, match="^effects is empty; allowed: at least one effect"):
+        search.extend("a.csv", [])
+
+
+def test_an_answer_of_learn_has_its_decisions_and_draws_its_curve(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learn, "decisions_json", lambda of, stage: [{"stage": stage, "rule": r} for r in of])
+    found = answer("learned", [law()], decisions={"a": ["r1", "r2"], "b": ["r3"]})
+    assert found.to_dict()["decisions"] == [{"stage": s, "rule": r} for s, r in (("a", "r1"), ("a", "r2"), ("b", "r3"))]
+    assert found.explained == {"a": (["r1", "r2"], [found.laws[0].name]), "b": (["r3"], [found.laws[0].name])}
+    (row,) = found.rows()
+    one = found.laws[0]
+    assert row == {"effect": one.name, "how": one.how, "at": one.at, "of": one.of, "unit": one.unit,
+                   "error_before": one.error_before, "error_after": one.error_after, "formula": ""}  # fmt: skip
+    ax = pytest.importorskip("matplotlib.figure").Figure().subplots()
+    one.how, one.at, one.of_unit = "force adds", "force", "mm"
+    found.plot(ax)
+    (line,) = ax.get_lines()
+    assert (
+        line.get_label() == one.name
+        and line.get_ydata().tolist() == list(one.y)
+        and line.get_xdata().tolist() == list(one.x)
+    )
+    assert ax.get_ylabel() == f"force adds at force [{one.unit}]" and len(ax.collections) == 1
+    cell = answer_verb.Answer._repr_html_(found)  # with a picture of it
+    assert '<img alt="' in cell and cell.index("<img") > cell.index("<table>")
