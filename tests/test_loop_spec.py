@@ -785,6 +785,12 @@ def test_what_the_system_does_not_give_is_no_error(monkeypatch: pytest.MonkeyPat
     assert system.of("slice") == []
 
 
+def test_the_scheduler_is_asked_by_linux_s_own_number_of_the_call() -> None:
+    """sched_setattr(2) of the tables of system calls of x86-64 and of ARM's 64 bits."""
+    machine = realtime.os.uname().machine
+    assert {"x86_64": 314, "aarch64": 274}.get(machine) == realtime._SCHED_SETATTR
+
+
 # ---- engines on a GPU, which stands still here -----------------------------------------------------------------------
 
 
@@ -813,7 +819,7 @@ class Kernel:
         found[engines.gpu.LAST_MODE], found[engines.gpu.LOST] = 2.0, np.arange(n) % 2
 
     def room(self, each: int, share: float, most: int) -> int:
-        assert each > 0 and share == 0.8 and most == 1 << 17
+        assert each == 8 * (engines.gpu.NUMBERS + 2 + len(PLANT.vanes)) and share == 0.8 and most == 1 << 17
         return 2
 
 
