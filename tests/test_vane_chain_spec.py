@@ -4,6 +4,7 @@ to the search, each against a closed form or a simulated machine.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -27,7 +28,7 @@ from vaneloop.identification.settings import COLOUR
 from vaneloop.identification.subsystem import Array, Parameter, Stage
 from vaneloop.identification.unmodelled.regressors import Quantity
 from vaneloop.identification.user_models.terms import COLUMN
-from vaneloop.identification.vane_chain import candidates, demand, experiment, resample
+from vaneloop.identification.vane_chain import candidates, demand, experiment, hum, resample
 from vaneloop.identification.vane_chain.actuator import _quadratic_drag
 from vaneloop.identification.vane_chain.alignment import (
     Late,
@@ -1723,3 +1724,113 @@ def test_speed_is_that_of_a_fifth_of_a_second_and_a_turn_begins_anew() -> None:
     }  # fmt: skip
     known, _ = resample.regimes_of(t, {"x_lvdt": t}, SimpleNamespace(far={"x_lvdt"}, fresh=gaps.fresh))  # type: ignore[arg-type]
     assert all(np.isnan(known[n][300:]).all() for n in known if n != "time") and not np.isnan(known["time"]).any()
+
+
+# ---- a recorder's hum and its low-pass -------------------------------------------------------------------------------
+
+
+def test_third_differences_are_where_four_rows_follow_each_other() -> None:
+    t = np.r_[np.arange(8) * 0.1, 1.0 + np.arange(5) * 0.1]  # two rows are missing
+    z, good = hum._third(Channel(t, t**3), 0.1)
+    assert good.tolist() == [True] * 5 + [False] * 3 + [True] * 2
+    assert z == pytest.approx(np.where(good, 6e-3, 0.0))
+
+
+def test_power_is_told_in_medians_of_what_is_nearby_by_the_largest_of_three_lines() -> None:
+    z = np.random.default_rng(1).standard_normal(4000)
+    z += 0.5 * np.sin(2.0 * np.pi * 300.0 * np.arange(4000) / 4000.0)
+    power = np.abs(np.fft.rfft(z)) ** 2
+    widest = np.array([power[max(k - 1, 0) : k + 2].max() for k in range(len(power))])
+    half = hum.HUM_NEARBY // 2
+    padded = np.pad(widest, half, mode="edge")
+    nearby = np.array([np.median(padded[k : k + hum.HUM_NEARBY]) for k in range(len(widest))])
+    np.testing.assert_allclose(hum._power(z), widest / nearby)
+    assert set(np.flatnonzero(hum._power(z) > 100.0)) == {299, 300, 301} and not hum._power(np.zeros(100)).any()
+
+
+def hummed(names: tuple[str, ...], hz: float = 13.37, rows: int = 4000, also: str = "") -> dict[str, Channel]:
+    """Noise in each channel at 100 Hz, and a line of twice its size in those named."""
+    t = 5.0 + 0.01 * np.arange(rows)
+    out = {}
+    for k, name in enumerate(("n_r", "x_lvdt", "i_cmd", "vigv", "n_dem")):
+        line = 2.0 * np.sin(2.0 * np.pi * hz * t + k) if name in names or name == also else 0.0
+        quiet = (
+            np.repeat([60.0, 61.0], rows // 2) if name == "n_dem" else np.random.default_rng(k).standard_normal(rows)
+        )
+        out[name] = Channel(t, quiet + line)
+    return out
+
+
+ANALOGUE = ("n_r", "x_lvdt", "i_cmd", "vigv")
+
+
+def test_a_common_line_is_in_every_channel_and_in_no_command() -> None:
+    made = hummed(ANALOGUE)
+    channels, commands = [made[n] for n in ANALOGUE], [made["n_dem"]]
+    found = hum._common_line(channels, commands, 0.01)
+    assert found is not None and abs(found - 13.37) <= 1.0 / 40.0
+    assert hum._common_line([*channels[:3], hummed(())["vigv"]], commands, 0.01) is None
+    assert hum._common_line(channels, [hummed((), also="n_dem")["n_dem"]], 0.01) is None
+    assert hum._common_line([hummed(())[n] for n in ANALOGUE], commands, 0.01) is None
+    slow = hummed(ANALOGUE, hz=0.05)  # two periods in the log are no line
+    assert hum._common_line([slow[n] for n in ANALOGUE], commands, 0.01) is None
+    line = hum._line(made["vigv"], found, 0.01)
+    t = made["vigv"].t
+    np.testing.assert_allclose(line, 2.0 * np.sin(2.0 * np.pi * 13.37 * t + 3.0), atol=0.2)
+    assert np.std(line) * 2.0**0.5 == pytest.approx(2.0, rel=0.05)
+
+
+def test_hum_is_taken_out_with_a_note_of_its_sizes_where_speed_and_two_others_have_it() -> None:
+    made = hummed(ANALOGUE)
+    log = Log("a.csv", made, ["before"])
+    out = hum.without_hum(log)
+    first, said = out.notes
+    assert (
+        first == "before"
+        and isinstance(said, Note)
+        and (said.kind, said.of) == ("converted", "n_r, x_lvdt, i_cmd, vigv")
+    )
+    sizes = re.fullmatch(
+        r"n_r, x_lvdt, i_cmd, vigv: a line at (13\.3\d) Hz in all of them is a recorder's hum, or its alias \("
+        r"n_r (\S+) %, x_lvdt (\S+) mm, i_cmd (\S+) mA, vigv (\S+) deg\); taken out", said,
+    )  # fmt: skip
+    assert sizes is not None and all(abs(float(s) - 2.0) < 0.2 for s in sizes.groups()[1:])
+    for k, name in enumerate(ANALOGUE):
+        assert np.std(out[name].values - np.random.default_rng(k).standard_normal(4000)) < 0.1
+    assert out["n_dem"] is log["n_dem"] and out.path == "a.csv"
+    for less in (
+        {n: c for n, c in made.items() if n != "n_r"}, {n: c for n, c in made.items() if n in ("n_r", "vigv", "n_dem")},
+        {n: c for n, c in made.items() if n != "n_dem"},
+        {n: Channel(c.t[:1000], c.values[:1000]) for n, c in made.items()},
+        {n: Channel(c.t, c.values, framed=n != "n_dem") for n, c in made.items()},
+    ):  # fmt: skip
+        other = Log("a.csv", less)
+        assert hum.without_hum(other) is other
+    framed = Log("a.csv", {**made, "x_lvdt": Channel(made["x_lvdt"].t, made["x_lvdt"].values, framed=True)})
+    assert hum.without_hum(framed)["x_lvdt"] is framed["x_lvdt"] and len(hum.without_hum(framed).notes) == 1
+
+
+@pytest.mark.parametrize(("kind", "second"), [("mean", 1.0 / 3.0), ("first order", 0.0), ("second order", 0.5)])
+def test_a_low_pass_delays_and_is_undone(kind: str, second: float) -> None:
+    """Of a parabola y = t^2 a filter 1 / (1 + d s + c d^2 s^2) leaves (t - d)^2 + d^2 (1 - 2 c), once it has begun."""
+    d, tick = 0.02, 1e-3
+    t = np.arange(2000) * tick
+    low = LowPass(kind, d)
+    late = LowPass(kind, d, late=0.0125).of(t[None], tick)[0]
+    behind = t[400:] - d + (0.5 * tick if kind == "mean" else 0.0)  # a mean of whole ticks lies half a tick beside
+    np.testing.assert_allclose(low.of(t[None], tick)[0][400:], behind, atol=1e-4)
+    np.testing.assert_allclose(late[400:], behind - 0.0125, atol=1e-4)
+    assert low.of(np.full((4, 5), 3.0), tick) == pytest.approx(np.full((4, 5), 3.0))  # begins as if it had stood so
+    bent = low.of((t**2)[None], tick)[0][400:]
+    np.testing.assert_allclose(bent, behind**2 + d * d * (1.0 - 2.0 * second), atol=1e-4)
+    dt = 0.01
+    rows = np.sin(np.arange(400) * dt * 3.0)
+    left = low.of_rows(low.before(rows, dt), dt)
+    assert np.abs(left - rows)[60:-60].max() < 0.01 < np.abs(low.of_rows(rows, dt) - rows)[60:-60].max()
+    held = LowPass(kind, d, held=True).of_rows(rows, dt)
+    straight = low.of_rows(rows, dt)
+    np.testing.assert_allclose(held[60:-60], np.sin((np.arange(400) * dt - d - 0.5 * dt) * 3.0)[60:-60], atol=0.01)
+    np.testing.assert_allclose(straight[60:-60], np.sin((np.arange(400) * dt - d) * 3.0)[60:-60], atol=0.01)
+    assert LowPass(late=-0.02).of_rows(rows, dt)[100:-100] == pytest.approx(
+        np.sin((np.arange(400) * dt + 0.02) * 3.0)[100:-100], abs=0.01
+    )
