@@ -4,6 +4,7 @@ which parameters and starts suit them, and what a curve does at each place.
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from pathlib import Path
@@ -28,6 +29,7 @@ from vaneloop.identification.selection.diagnosis import diagnose_stage
 from vaneloop.identification.settings import COARSE_STOPS, LEVEL_SPREAD
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.user_models import bound_system, by_log, experiment, terms
+from vaneloop.identification.user_models import motion as motion_of
 from vaneloop.identification.user_models.bound_system import BoundSystem, steps_seen
 from vaneloop.identification.user_models.by_log import ByLog, Logs, _loaded, as_given, bind, parameter_warnings
 from vaneloop.identification.user_models.codegen import try_law
@@ -2104,3 +2106,18 @@ def test_what_laws_do_to_each_log_and_parameters_that_are_not_needed_any_more_ar
         "lag does not help on d: error with it over error without it is 1.23",
         "zero: not needed any more, set to 0 (it was 1.235 N while lag, play was missing)", "loaded", "again", "warned",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("cutoff", [0.475, 0.2, 0.03])
+def test_the_weights_of_a_low_pass_leave_a_cubic_and_are_nobody_s_to_change(cutoff: float) -> None:
+    weights = motion_of._kernel(cutoff)
+    n = math.ceil(1.0 / cutoff)
+    assert len(weights) == 2 * n + 1 and weights == pytest.approx(weights[::-1])
+    k = np.arange(-n, n + 1)
+    assert [float(np.sum(weights * k**power)) for power in range(4)] == pytest.approx([1.0, 0.0, 0.0, 0.0], abs=1e-9)
+    bell = np.cos(0.5 * np.pi * k / (n + 1)) ** 4
+    parabola = weights / bell  # what is left of them beside a window that ends after one period
+    assert np.polyval(np.polyfit(k, parabola, 2), k) == pytest.approx(parabola)
+    with pytest.raises(ValueError, match="read-only"):  # they are kept for others
+        weights[0] = 1.0
+    assert motion_of._kernel(cutoff) is weights
