@@ -447,7 +447,8 @@ def moving(**more: Any) -> Any:
         "kind": "simulate", "model": tanks, "states": {"h1": "m", "h2": "m"}, "inputs": {"q": "m"},
         "outputs": {"h1": "m", "level": "m"}, "commands": {}, "units": {}, "position": "", "velocity": "",
         "parameters": [SimpleNamespace(name="c", value=0.3, tolerance=0.0)], "rates": {}, "masses": {},
-        "force_unit": "N", "allows": lambda kind, name: True, "reading_of": lambda name: f"{name}_sensor",
+        "unit_of_force": lambda name: "N", "allows": lambda kind, name: True,
+        "reading_of": lambda name: f"{name}_sensor",
     }  # fmt: skip
     s = SimpleNamespace(**given | more)
     h = np.array([1.0 + 0.2 * np.sin(T), 0.5 + 0.1 * np.cos(0.7 * T)])

@@ -133,7 +133,10 @@ def test_every_family_and_its_nominal_model_name_the_same_things(name: str) -> N
         kind, _ = f.where(place)
         assert short in LAWS[kind if kind in ("force", "state") else "signal"], law
     assert all(
-        law in f.laws or law.endswith((".bias", ".cubic", ".stiction", ".stick_slip", ".overflow_to_lower"))
+        law in f.laws
+        or law.endswith(
+            (".bias", ".cubic", ".end_stop", ".overflow_to_lower", ".radiation", ".stiction", ".stick_slip")
+        )
         for o in f.outside.values()
         for group in o.amounts_to
         for law in group

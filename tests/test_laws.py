@@ -209,6 +209,37 @@ def test_springs_and_their_gap() -> None:
     assert list(force("cubic_spring", (4.0,), x, x)) == pytest.approx(4.0 * x**3)
 
 
+def test_an_end_stop_pushes_back_beyond_its_ends_only() -> None:
+    x = np.array([-2.0, -0.5, 0.0, 1.0, 1.5])
+    assert list(force("end_stop", (10.0, -0.5, 1.0), x, x)) == pytest.approx([-15.0, 0.0, 0.0, 0.0, 5.0])
+
+
+def test_a_square_keeps_the_greatest_value_and_loses_the_sign() -> None:
+    g = SIZE.greatest
+    assert list(signal("square", 1.0, u=np.array([-g, 0.0, 0.5 * g]))) == pytest.approx([g, 0.0, 0.25 * g])
+
+
+@pytest.mark.parametrize(("unit", "zero"), [("degC", 273.15), ("K", 0.0), ("degF", 459.67)])
+def test_a_body_radiates_as_stefan_and_boltzmann_say(unit: str, zero: float) -> None:
+    z = replace(SIZE, low=300.0, high=400.0, unit=unit)
+    alone, to = STATE_LAWS["radiation"], STATE_LAWS["radiation_to"]
+    assert alone.constant is not None and to.constant is not None
+    lost = laws.state_rate(alone.code, 350.0, np.array([2e-12, 310.0, alone.constant(z)]))
+    assert lost == pytest.approx(2e-12 * ((350.0 + zero) ** 4 - (310.0 + zero) ** 4))
+    assert laws.state_rate(to.code, 350.0, np.array([2e-12, to.constant(z)]), 310.0) == pytest.approx(lost)
+    assert laws.state_rate(to.code, 310.0, np.array([2e-12, to.constant(z)]), 310.0) == 0.0
+    for law in (alone, to):
+        (size, *_), starts = law.make(z)
+        assert size.low == 0.0 < starts[0][0] < starts[-1][0] < size.high and law.suits(unit) and not law.suits("V")
+
+
+def test_a_rise_in_kelvin_is_one_over_a_room() -> None:
+    constant = STATE_LAWS["radiation"].constant
+    assert constant is not None
+    assert constant(replace(SIZE, low=0.0, high=80.0, unit="K")) == 293.15
+    assert constant(replace(SIZE, low=280.0, high=360.0, unit="K")) == 0.0
+
+
 def test_state_laws() -> None:
     rate = {
         n: [laws.state_rate(law.code, x, np.array([2.0, 0.0, 0.0, 0.0])) for x in (-4.0, 4.0)]

@@ -19,10 +19,7 @@ PACKAGE = ROOT / "vaneloop" / "identification"
 KINDS = ("principle", "physics", "numerics", "benchmark", "budget of work", "judgement")
 # Numbers that decide nothing: what they count is laid out in arrays and codes, and any other would do as well.
 LAYOUT = {
-    "candidates/laws.py": {
-        "MEMORY", "PARAMETERS",  # columns of a law's state and parameters
-        "BACKLASH_GAP", "FRICTION_ASYMMETRY",  # codes of laws
-    },
+    "candidates/laws.py": {"MEMORY", "PARAMETERS"},  # columns of a law's state and parameters
     "user_models/terms.py": {"INPUT", "OUTPUT", "COLUMN", "NOTHING", "HOW"},  # numbers of quantities and of places
     "user_models/user_laws.py": {"MOST_PARAMETERS", "MOST_MEMORY", "FIRST_CODE"},  # room of users' laws; their codes
     "unmodelled/curve_candidates.py": {"JUMP"},  # index of an amplitude that is of no function of the basis

@@ -1152,7 +1152,7 @@ MOVING: dict[str, Any] = {
             "kind 'closed_loop' needs control=, a function (r, y, p), and commands=, name -> unit of what it returns",
         ),
         (MOVING | {"rates": {"speed": "way"}}, "rates: 'way' is not a state; states are angle, speed"),
-        (MOVING | {"masses": {"angle": "m"}}, "masses: 'angle' is not a velocity of rates"),
+        (MOVING | {"masses": {"angle": "m"}}, "masses: 'angle' is no velocity: not of rates, nor in a unit of one"),
         (MOVING | {"masses": {"speed": "m"}}, "masses: 'm' is not a parameter; parameters are a"),
         (MOVING | {"start": {"way": 1.0}}, "start: 'way' is not a state; states are angle, speed"),
         (

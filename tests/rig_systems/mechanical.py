@@ -242,6 +242,7 @@ QUARTER_CAR = Family(
         "bump_stop": Outside(
             "a bump stop ends the travel to one side", 0.05, 5.0,
             rate=lambda t, x, u, p, s, d: [d[0] - s * p.spring * max(x[1] - 0.03, 0.0) / p.mass, d[1]],
+            amounts_to=(frozenset({"rate.end_stop"}),),
         ),
     },
     same=(frozenset({"rate.force_offset", "axle.bias"}),),  # m (a + b) = m a + a constant force

@@ -204,7 +204,8 @@ THERMAL_MASS = Family(
             "radiates with the fourth power of the temperature", 0.02, 1.0, rate=_radiate,
             # (T + x)^4 - T^4 = 4 T^3 x + 6 T^2 x^2 + 4 T x^3 + x^4; the loss takes the first term
             amounts_to=(
-                frozenset({"rise.quadratic_drag"}), frozenset({"rise.quadratic_drag", "rise.cubic"}),
+                frozenset({"rise.radiation"}), frozenset({"rise.quadratic_drag"}),
+                frozenset({"rise.quadratic_drag", "rise.cubic"}),
             ),
         ),
         "draught": Outside(

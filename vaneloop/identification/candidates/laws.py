@@ -38,7 +38,7 @@ PARAMETERS = 3  # most parameters of one law
 BIAS, GAIN, ASYMMETRIC_GAIN, ABSOLUTE, SQUARE_ROOT, CUBIC, DEAD_ZONE, SATURATION, SMOOTH_SATURATION, QUANTISATION = (
     range(1, 11)
 )
-PLAY, RATE_LIMIT, LAG, SECOND_ORDER_LAG, DEAD_TIME, STICTION, STICK_SLIP = range(11, 18)
+PLAY, RATE_LIMIT, LAG, SECOND_ORDER_LAG, DEAD_TIME, STICTION, STICK_SLIP, SQUARE = range(11, 19)
 
 
 @inlined
@@ -64,6 +64,8 @@ def transform(code: int, k: int, t: Array, u: Array, p: Array, s: Array) -> floa
         return x + p[0] * ((root if x > 0.0 else -root) - x)
     if code == CUBIC:
         return x + p[0] * x * x * x
+    if code == SQUARE:  # p[1]: magnitude that stays as it is
+        return x + p[0] * (x * x / p[1] - x)
     if code == DEAD_ZONE:
         if x > p[0]:
             return x - p[0]
@@ -199,7 +201,7 @@ def argument(code: int, y: float, p: Array) -> float:
 FORCE_OFFSET, VISCOUS, COULOMB, STRIBECK, QUADRATIC_DRAG, SPRING, CUBIC_SPRING, ELASTIC_PLASTIC, BOUC_WEN = range(
     21, 30
 )
-BACKLASH_GAP, FRICTION_ASYMMETRY = 30, 31
+BACKLASH_GAP, FRICTION_ASYMMETRY, END_STOP = range(30, 33)
 HYSTERETIC = (ELASTIC_PLASTIC, BOUC_WEN)  # carry a force at rest: where they start is unknown
 SWITCHING = np.array([COULOMB, STRIBECK, ELASTIC_PLASTIC, BOUC_WEN, BACKLASH_GAP, FRICTION_ASYMMETRY])
 SWITCHING.setflags(write=False)
@@ -237,6 +239,8 @@ def force_of(
         return level * _slip(v, small) * (1.0 + asymmetry if v > 0.0 else 1.0 - asymmetry)
     if code == QUADRATIC_DRAG:
         return p[0] * v * abs(v)
+    if code == END_STOP:  # contact stiffness p[0] beyond the displacements p[1] and p[2]
+        return p[0] * (min(x - p[1], 0.0) + max(x - p[2], 0.0))
     h = 0.5 * gap
     if code == SPRING or code == CUBIC_SPRING:
         d = x - h if x > h else (x + h if x < -h else 0.0)
@@ -317,12 +321,13 @@ def load(code: int, x: float, p: Array, gap: float, asymmetry: float, held: floa
 STATE_OFFSET, LEAK, STATE_QUADRATIC, STATE_SQUARE_ROOT, STATE_CUBIC, STATE_LIMIT, STATE_RATE_LIMIT, STATE_OVERFLOW = (
     range(41, 49)
 )
+RADIATION, RADIATION_TO = range(49, 51)
 
 
 @inlined
-def state_rate(code: int, x: float, p: Array) -> float:
-    """What law ``code`` takes off the derivative of the state ``x``. Limits take nothing off; the simulation applies
-    them.
+def state_rate(code: int, x: float, p: Array, other: float = 0.0) -> float:
+    """What law ``code`` takes off the derivative of the state ``x``, where it is of an ``other`` quantity, too. Limits
+    take nothing off; the simulation applies them.
     """
     if code == STATE_OFFSET:
         return p[0]
@@ -334,4 +339,9 @@ def state_rate(code: int, x: float, p: Array) -> float:
         return p[0] * math.sqrt(x) if x > 0.0 else -p[0] * math.sqrt(-x)
     if code == STATE_CUBIC:
         return p[0] * x * x * x
+    if code == RADIATION:  # Stefan and Boltzmann; p[1]: the surroundings, p[2]: absolute temperature at x = 0
+        body, around = x + p[2], p[1] + p[2]
+        return p[0] * (body**4 - around**4)
+    if code == RADIATION_TO:  # to what ``other`` measures; p[1]: absolute temperature at 0
+        return p[0] * ((x + p[1]) ** 4 - (other + p[1]) ** 4)
     return 0.0

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vaneloop.base.quantities import absolute_zero, kind_of
 from vaneloop.identification.candidates import laws
 from vaneloop.identification.settings import TRIED_SIZES
 from vaneloop.identification.subsystem import Parameter
@@ -32,6 +33,7 @@ class Size:
     force       RMS of the force (or derivative) that the law adds to
     force_unit  of that
     speed, speed_unit, travel, travel_unit   RMS velocity and half range of the displacement of a force law
+    ends    smallest and largest displacement of a force law
     """
 
     low: float
@@ -48,6 +50,7 @@ class Size:
     travel: float = 1.0
     travel_unit: str = "-"
     held: float = 0.0
+    ends: tuple[float, float] = (-1.0, 1.0)
 
     @property
     def half(self) -> float:
@@ -70,6 +73,7 @@ class Law:
     holds   a law of the same place that this one is at some values of its parameters, and where, as `Effect.holds`
     onward  from values of the law that it holds to starts of this one, as `Effect.onward`
     constant  a number of the law that is not free, from the size of the data; it follows the parameters
+    of        kinds of quantity (`base.quantities`) that the law makes sense for; empty: any
     """
 
     name: str
@@ -81,6 +85,11 @@ class Law:
     constant: Callable[[Size], float] | None = None
     holds: tuple[str, tuple[float | None, ...]] | None = None
     onward: Callable[[Sequence[float]], list[tuple[float, ...]]] | None = None
+    of: tuple[str, ...] = ()
+
+    def suits(self, unit: str) -> bool:
+        """Whether the law makes sense for a quantity in this unit."""
+        return not self.of or kind_of(unit) in self.of
 
 
 # ---- parameters from the size of the data ----------------------------------------------------------------------------
@@ -123,6 +132,12 @@ def _greatest(z: Size) -> float:
 def _cubic(z: Size) -> _Made:
     unit = 1.0 / z.greatest**2
     return _one("coefficient", f"1/({z.unit})^2", 0.0, -5.0 * unit, 20.0 * unit, _both(unit, (0.02, 0.1, 0.3)))
+
+
+def _square(z: Size) -> _Made:
+    # a little beyond the whole square, so that the interval of one lies within
+    ps = (Parameter("share", 0.0, "-", -2.0, 1.2),)
+    return ps, tuple((v,) for v in _both(1.0, (0.05, 0.25, 1.0)))
 
 
 def _dead_zone(z: Size) -> _Made:
@@ -285,6 +300,19 @@ def _bouc_wen(z: Size) -> _Made:
     return (*ps, Parameter("sharpness", 1.0, "-", 0.2, 20.0)), tuple((*s, 1.0) for s in starts)
 
 
+def _end_stop(z: Size) -> _Made:
+    k, (low, high) = z.force / z.travel, z.ends
+    r = high - low
+    ps = (
+        Parameter("stiffness", 0.0, f"({z.force_unit})/({z.travel_unit})", 0.0, 1e4 * k),
+        Parameter("low", low - r, z.travel_unit, low - r, high, shape=True),
+        Parameter("high", high + r, z.travel_unit, low, high + r, shape=True),
+    )
+    ways = [(d * r * a, d * r * b) for d in (0.1, 0.3) for a, b in ((1, 1), (1, 0), (0, 1))]  # how deep, on each side
+    sides = [(low + a if a else low - r, high - b if b else high + r) for a, b in ways]
+    return ps, tuple((a * k, *at) for at in sides for a in (3.0, 10.0, 30.0))
+
+
 def _backlash_gap(z: Size) -> _Made:
     return _one("gap", z.travel_unit, 0.0, 0.0, z.travel, [part * z.travel for part in (0.01, 0.03, 0.1, 0.2, 0.4)])
 
@@ -325,6 +353,28 @@ def _state_cubic(z: Size) -> _Made:
     return _power(z, 3.0, f"1/(({z.unit})^2 s)")
 
 
+def _absolute_zero(z: Size) -> float:
+    """Absolute temperature at the place's zero. What is in K and begins near 0 is a rise over a room's temperature."""
+    zero = absolute_zero(z.unit)
+    return zero if zero > 0.0 or z.low > 0.1 * (z.high - z.low) else absolute_zero("degC") + 20.0
+
+
+def _radiation(z: Size) -> _Made:
+    zero = _absolute_zero(z)
+    c = z.rate / max((z.high + zero) ** 4 - (z.low + zero) ** 4, 1e-300)
+    r = z.high - z.low
+    ps = (
+        Parameter("coefficient", 0.0, f"1/(({z.unit})^3 s)", 0.0, 100.0 * c),
+        Parameter("surroundings", z.low, z.unit, min(max(z.low - 3.0 * r, -zero), z.low), z.high, shape=True),
+    )
+    return ps, tuple((part * c, z.low) for part in (0.05, 0.3, 1.0, 3.0))
+
+
+def _radiation_to(z: Size) -> _Made:
+    (coefficient, _), starts = _radiation(z)
+    return (coefficient,), tuple((c,) for c, _ in starts)
+
+
 LAWS: dict[str, dict[str, Law]] = {
     "signal": {
         law.name: law
@@ -351,6 +401,14 @@ LAWS: dict[str, dict[str, Law]] = {
                 "bends as a square root does",
                 _square_root,
                 "steep near zero, flat far from it",
+                constant=_greatest,
+            ),
+            Law(
+                "square",
+                laws.SQUARE,
+                "bends as a square does",
+                _square,
+                "flat near zero, steep far from it; the sign is lost",
                 constant=_greatest,
             ),
             Law("cubic", laws.CUBIC, "a cubic term", _cubic, "grows at both ends"),
@@ -438,6 +496,13 @@ LAWS: dict[str, dict[str, Law]] = {
             Law("spring", laws.SPRING, "force proportional to displacement", _spring),
             Law("cubic_spring", laws.CUBIC_SPRING, "hardening spring", _cubic_spring),
             Law(
+                "end_stop",
+                laws.END_STOP,
+                "a stiff contact at each end of the travel",
+                _end_stop,
+                "sharp turns at the ends",
+            ),
+            Law(
                 "elastic_plastic",
                 laws.ELASTIC_PLASTIC,
                 "Coulomb friction behind a spring",
@@ -487,6 +552,15 @@ LAWS: dict[str, dict[str, Law]] = {
             Law("quadratic_drag", laws.STATE_QUADRATIC, "loses with its square", _state_quadratic),
             Law("cubic", laws.STATE_CUBIC, "loses with its cube", _state_cubic),
             Law(
+                "radiation",
+                laws.RADIATION,
+                "radiates heat to its surroundings",
+                _radiation,
+                "loses more and more as it grows hot",
+                constant=_absolute_zero,
+                of=("temperature",),
+            ),
+            Law(
                 "saturation",
                 laws.STATE_LIMIT,
                 "cannot leave a range (an overflow, an end stop)",
@@ -496,12 +570,22 @@ LAWS: dict[str, dict[str, Law]] = {
             ),
             Law("rate_limit", laws.STATE_RATE_LIMIT, "cannot change faster than a limit", _rate_limit, "ramps", True),
             Law(
+                "radiation_to",
+                laws.RADIATION_TO,
+                "radiates heat to surroundings that are measured",
+                _radiation_to,
+                "loses more and more as it grows hot",
+                constant=_absolute_zero,
+                of=("temperature",),
+            ),
+            Law(
                 "overflow",
                 laws.STATE_OVERFLOW,
                 "what is above a level goes into another state",
                 _overflow,
                 "a flat top here, a rise there",
                 True,
+                of=("length", "volume", "mass", "share"),
             ),
         )
     },

@@ -296,7 +296,7 @@ def candidates(bound: BoundSystem, values: Array) -> list[Candidate]:
         if s.allows("parameter", p.name):
             put("parameter times", i, p.name, "-", 0.5, mean=p.tolerance == 0.0)
     if moves:
-        for i, (name, unit) in enumerate(s.states.items()):
+        for i, name in enumerate(s.states):
             if name in s.rates.values() and name not in s.rates:
                 continue
             if s.allows("force" if name in s.rates else "state", name):
@@ -304,7 +304,7 @@ def candidates(bound: BoundSystem, values: Array) -> list[Candidate]:
                 rate = size_of(np.sqrt(np.mean(np.concatenate([np.gradient(v, r.t) for v, r in pairs]) ** 2)))
                 mass = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
                 own = [s.rates[name]] if name in s.rates else []  # a force on what moves is one of its position, too
-                put("state adds", i, name, s.force_unit if name in s.masses else f"({unit})/s", rate * mass, near=own)
+                put("state adds", i, name, s.unit_of_force(name), rate * mass, near=own)
     if s.kind == "force" and s.allows("force", "force"):
         y = bound.measured[0]
         size = size_of(0.5 * np.sqrt(np.nanmean(y**2)))

@@ -12,7 +12,7 @@ from plant.model import Learned
 from vaneloop.base.durations import folded
 from vaneloop.base.errors import InputError
 from vaneloop.base.forms import NAMED
-from vaneloop.identification.candidates.library import LAWS, SIGNAL_LAWS, STATE_LAWS, Law, Size
+from vaneloop.identification.candidates.library import FORCE_LAWS, LAWS, SIGNAL_LAWS, STATE_LAWS, Law, Size
 from vaneloop.identification.settings import CURVE_BOUND, LEVEL_SPREAD, RUN_AWAY
 from vaneloop.identification.subsystem import Array, Effect, Parameter, StageError, size_of
 from vaneloop.identification.user_models.codegen import Dispatch, try_law
@@ -33,6 +33,8 @@ from vaneloop.identification.user_models.terms import COLUMN, HOW, INPUT, OUTPUT
 
 __all__ = ["CURVE_LAW", "Course", "from_file", "nominal_course", "places"]
 
+# of a speed whose displacement is no state
+NOT_OF_SPEED = tuple(n for n in FORCE_LAWS if n not in ("coulomb", "stribeck", "friction_asymmetry"))
 SENSOR_OF_FORCE = ("gain", "saturation", "lag", "second_order_lag", "dead_time")  # what follows a sum of forces
 
 
@@ -45,23 +47,24 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
     out: list[Placed] = []
     effects: list[Effect] = []
 
-    def put(name: str, law: Law, place: str, at: int, size: Size, constant: float) -> None:
+    def put(name: str, law: Law, place: str, at: int, size: Size, to: int = -1) -> None:
         ps, starts = law.make(size)
         holds: tuple[tuple[str, tuple[float | None, ...]], ...] = ()
         if law.holds is not None:
             other, pattern = law.holds
             holds = ((f"{name.rpartition('.')[0]}.{other}", pattern),)
         effects.append(Effect(name, tuple(ps), starts, law.looks, holds, law.onward))
-        out.append(Placed(name, law, place, at, constant, neutral=np.array([q.value for q in ps])))
+        constant = law.constant(size) if law.constant else 0.0
+        out.append(Placed(name, law, place, at, constant, neutral=np.array([q.value for q in ps]), to=to))
 
     def add(prefix: str, place: str, name: str, at: int, family: str, size: Size, leave: tuple[str, ...] = ()) -> None:
         for law in LAWS[family].values():
-            if law.name not in leave and (data.ordered or not law.memory):
-                put(f"{prefix}.{law.name}", law, place, at, size, law.constant(size) if law.constant else 0.0)
+            if law.name not in leave and law.suits(size.unit) and (data.ordered or not law.memory):
+                put(f"{prefix}.{law.name}", law, place, at, size)
         for own in s.laws:
-            if own.on == family and own.allowed(place, name, by_default="bias" not in leave):
+            if own.on == family and own.allowed(place, name, by_default="bias" not in leave) and "spring" not in leave:
                 try_law(own, prefix, size)
-                put(f"{prefix}.{own.name}", dispatch.own[family][own.name], place, at, size, 0.0)
+                put(f"{prefix}.{own.name}", dispatch.own[family][own.name], place, at, size)
 
     outputs = list(s.outputs)
     if s.kind == "force" and s.allows("force", "force"):
@@ -72,7 +75,7 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
         size = _size(
             data.records, [u[0] for u in data.u], unit, force=force, force_unit=next(iter(s.outputs.values())),
             speed=size_of(np.sqrt(np.mean(v**2))), speed_unit=f"{unit}/s",
-            travel=size_of(np.ptp(x) / 2, np.max(np.abs(x))), travel_unit=unit,
+            travel=size_of(np.ptp(x) / 2, np.max(np.abs(x))), travel_unit=unit, ends=_ends(x),
         )  # fmt: skip
         add("force", "force", "force", 0, "force", size)
     if s.kind in ("simulate", "closed_loop"):
@@ -83,24 +86,35 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
                 continue  # a displacement is the integral of its velocity, whatever else is missing
             values = states[i]
             rates = np.concatenate([np.gradient(w, r.t) for w, r in zip(values, data.records, strict=True)])
+            m = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
+            moving: dict[str, Any] = {
+                "force": size_of(np.sqrt(np.nanmean(rates**2)) * m), "force_unit": s.unit_of_force(name),
+                "speed": size_of(np.sqrt(np.nanmean(np.concatenate(values) ** 2))), "speed_unit": unit,
+            }  # fmt: skip
             if name in s.rates:
-                j = list(s.states).index(s.rates[name])
-                z = states[j]
-                m = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
-                force_unit = s.force_unit if name in s.masses else f"({unit})/s"
+                z = np.concatenate(states[list(s.states).index(s.rates[name])])
                 size = _size(
-                    data.records, values, unit, force=size_of(np.sqrt(np.nanmean(rates**2)) * m),
-                    force_unit=force_unit,
-                    speed=size_of(np.sqrt(np.nanmean(np.concatenate(values) ** 2))), speed_unit=unit,
-                    travel=size_of(np.ptp(np.concatenate(z)) / 2), travel_unit=s.states[s.rates[name]],
-                )  # fmt: skip
+                    data.records,
+                    values,
+                    unit,
+                    **moving,
+                    travel=size_of(np.ptp(z) / 2),
+                    travel_unit=s.states[s.rates[name]],
+                    ends=_ends(z),
+                )
                 add(name, "force", name, i, "force", size)
             else:
                 size = _size(data.records, values, unit)
-                add(name, "state", name, i, "state", size, ("overflow",))
+                add(name, "state", name, i, "state", size, ("overflow", "radiation_to"))
+                if name in s.speeds:  # friction asks for no displacement; its other laws are those of a state
+                    add(name, "force", name, i, "force", _size(data.records, values, unit, **moving), NOT_OF_SPEED)
                 for j, (other, other_unit) in enumerate(s.states.items()):  # into any other of the same kind
-                    if j != i and other_unit == unit and other not in s.rates.values():
-                        put(f"{name}.overflow_to_{other}", STATE_LAWS["overflow"], "state", i, size, float(j))
+                    stores = STATE_LAWS["overflow"].suits(unit) and other not in s.rates.values()
+                    if j != i and other_unit == unit and stores:
+                        put(f"{name}.overflow_to_{other}", STATE_LAWS["overflow"], "state", i, size, j)
+                for j, (other, other_unit) in enumerate(s.inputs.items() if s.kind == "simulate" else ()):
+                    if other_unit == unit and STATE_LAWS["radiation_to"].suits(unit):
+                        put(f"{name}.radiation_to_{other}", STATE_LAWS["radiation_to"], "state", i, size, INPUT + j)
     signals = s.commands if s.kind == "closed_loop" else s.inputs
     for i, (name, unit) in enumerate(signals.items()):
         if s.allows("input", name):
@@ -119,6 +133,12 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
         prefix = s.reading_of(name)
         add(prefix, "output", name, i, "signal", _size(data.records, rows, s.outputs[name]), leave)
     return out, effects
+
+
+def _ends(x: Array) -> tuple[float, float]:
+    """Smallest and largest of a displacement; of one that stands still, apart."""
+    low, high = float(np.min(x)), float(np.max(x))
+    return (low, high) if high > low else (low - 1.0, high + 1.0)
 
 
 def _size(records: Sequence[Record], rows: list[Array], unit: str, **more: Any) -> Size:
@@ -189,7 +209,7 @@ def nominal_course(runner: Runner, values: Array) -> Course:
             else:
                 course.commands[i].append(np.linspace(-1.0, 1.0, len(r.t)))
     for i, name in enumerate(names):
-        if name in s.rates:
+        if name in s.speeds:
             course.smalls[i] = 1e-3 * float(np.sqrt(np.mean(np.concatenate(course.states[i]) ** 2)))
     return course
 

@@ -139,7 +139,8 @@ if len(code) > 0:
         c = code[i]
         {own}if c > 40:
             if c != STATE_LIMIT and c != STATE_RATE_LIMIT and c != STATE_OVERFLOW:
-                dx[w] -= state_rate(c, AT[w], rows[i])
+                other = 0.0 if to[i] < INPUT else u[to[i] - INPUT]
+                dx[w] -= state_rate(c, AT[w], rows[i], other)
         elif not memory[i]:
             dx[w] -= force_of(c, AT[w], AT[position[w]], False, rows[i], gap[w], asymmetry[w], small[w], none) / mass[w]
     if holds:
@@ -331,8 +332,8 @@ def between(u, slope, t, k, part):
 
 
 {curved}@jit
-def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, position, gap, asymmetry, small, mass, steps,
-        line, slopes, n_commands, e_code, e_at, e_out, e_rows, out{more}):
+def run(t, inputs, p, x0, restart, at_restart, code, where, to, memory, rows, position, gap, asymmetry, small, mass,
+        steps, line, slopes, n_commands, e_code, e_at, e_out, e_rows, out{more}):
     n, m = len(t), len(x0)
     x = x0.copy()
     u = np.zeros(max(n_commands if LOOP else len(inputs), 1))
@@ -425,11 +426,11 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, memory, rows, positi
                     if code[i] == STATE_LIMIT:
                         w = where[i]
                         x[w] = min(max(x[w], rows[i, 0]), rows[i, 1])
-                    elif code[i] == STATE_OVERFLOW:  # what is cut off goes into another state, the row's constant
+                    elif code[i] == STATE_OVERFLOW:  # what is cut off goes into another state
                         w = where[i]
                         over = max(x[w] - rows[i, 0], 0.0)
                         x[w] -= over
-                        x[int(rows[i, 2])] += rows[i, 1] * over
+                        x[to[i]] += rows[i, 1] * over
             {stays}
         for w in range(m):
             if not np.isfinite(x[w]) or abs(x[w]) > 1e150:

@@ -47,6 +47,7 @@ _SWITCHING = frozenset(laws.SWITCHING.tolist())
 class Placed:
     """A law at a place: effect name, law, kind of place, index of the signal or state there, constant.
 
+    to     what else it acts between: a state, from `INPUT` on an input; -1: nothing
     curve  what it does, where it is a function of some quantity that nobody named; its place is then "curve"
     """
 
@@ -58,6 +59,7 @@ class Placed:
     columns: slice = field(default_factory=lambda: slice(0, 0))
     neutral: Array = field(default_factory=lambda: np.zeros(0))
     curve: Curve | None = None
+    to: int = -1
 
 
 class Runner:
@@ -352,18 +354,19 @@ class Runner:
         return [(m, known.index(masses[n])) for m, n in enumerate(self.system.states) if n in masses]
 
     @cached_property
-    def _nothing(self) -> tuple[Array, Array, Array, Array]:
+    def _nothing(self) -> tuple[Array, Array, Array, Array, Array]:
         none = np.zeros(0, dtype=np.int64)
-        return none, none, np.zeros((0, self.dispatch.parameters + 1)), np.zeros(0, dtype=np.bool_)
+        return none, none, none, np.zeros((0, self.dispatch.parameters + 1)), np.zeros(0, dtype=np.bool_)
 
-    def _in_the_loop(self, active: list[tuple[Placed, Array]]) -> tuple[Array, Array, Array, Array]:
-        """Of laws that act within a simulation: codes, places, parameters, and whether they remember."""
+    def _in_the_loop(self, active: list[tuple[Placed, Array]]) -> tuple[Array, Array, Array, Array, Array]:
+        """Of laws that act within a simulation: codes, places, what else, parameters, and whether they remember."""
         if not active:
             return self._nothing
         code = np.array([q.law.code for q, _ in active], dtype=np.int64)
         where = np.array([q.at for q, _ in active], dtype=np.int64)
+        to = np.array([q.to for q, _ in active], dtype=np.int64)
         memory = np.array([q.law.memory for q, _ in active], dtype=np.bool_)
-        return code, where, np.array([row for _, row in active]), memory
+        return code, where, to, np.array([row for _, row in active]), memory
 
     def _simulate(
         self, p: Array, x0: Array, log: int, active: list[tuple[Placed, Array]], steps: int, upto: int | None = None
@@ -381,7 +384,7 @@ class Runner:
                     gap = gap + of
                 else:
                     asymmetry = asymmetry + of
-        code, where, rows, memory = self._in_the_loop(inside)
+        code, where, to, rows, memory = self._in_the_loop(inside)
         mass = self._no_states + 1.0
         for m, k in self._masses:
             mass[m] = p[k]
@@ -392,7 +395,7 @@ class Runner:
                 if q.place == "input":
                     u[q.at] = self.dispatch.apply(q.law.code, t, np.ascontiguousarray(u[q.at]), row)
         ends = [(q, row) for q, row in active if q.place in ("input", "output")] if loop else []
-        e_code, e_at, e_rows, _ = self._in_the_loop(ends)
+        e_code, e_at, _, e_rows, _ = self._in_the_loop(ends)
         e_out = np.array([q.place == "output" for q, _ in ends], dtype=np.bool_)
         own_forces = range(FIRST_CODE["force"], FIRST_CODE["state"])
         if any(q.law.code in _SWITCHING or q.law.code in own_forces for q, _ in inside):
@@ -403,13 +406,13 @@ class Runner:
         rough = 0
         jumping = [c for c, row in plain if c.simulated and c.parts(row)[1]]
         if jumping and steps < SWITCHED:  # of a speed it is friction, and runs as that of the library does
-            rough = 0 if any(name in s.rates for c in jumping for _, name in c.quantities) else steps
+            rough = 0 if any(name in s.speeds for c in jumping for _, name in c.quantities) else steps
             steps = SWITCHED
         kernel, slow = (self.kernel, self.slow) if not curves else self._kernels_for_curves(bool(surfaces))
         out = np.full((len(s.outputs), len(t)), np.nan)
         arguments: tuple[Any, ...] = (
-            t, np.ascontiguousarray(u), p if len(p) else np.zeros(1), x0, restart, at_restart, code, where, memory,
-            rows, self._position, gap,
+            t, np.ascontiguousarray(u), p if len(p) else np.zeros(1), x0, restart, at_restart, code, where, to,
+            memory, rows, self._position, gap,
             asymmetry, self.smalls, mass, steps, s.between != "hold", self._rates(log, t, u, changed), len(s.commands),
             e_code, e_at, e_out, e_rows, out,
         )  # fmt: skip

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vaneloop.base.quantities import kind_of
 from vaneloop.identification.subsystem import Array, Parameter, StageError
 from vaneloop.identification.user_models.user_laws import Law, check_parameters, is_name
 
@@ -80,9 +81,9 @@ class System:
                 "measured" there
     states      simulate: name -> unit, in the order in which the model returns their derivatives
     rates       simulate: velocity -> displacement, for states that are these; laws of friction then act on the velocity
-    masses      simulate: velocity -> name of the parameter that divides forces there, so that laws there are in units
-                of force
-    force_unit  unit of forces on states with a mass
+    masses      simulate: velocity -> name of the parameter that divides forces there (of an angular velocity: torques),
+                so that laws there are in units of force
+    force_unit  unit of forces on states with a mass; default: N, and N m where an angular velocity is driven
     output      simulate: function output(x, u, p); default: the states that are named like the outputs
     start       state -> value at the start of a log, or "fitted"; others start at their measured value, velocities of
                 rates at rest, and what is not measured is fitted
@@ -111,7 +112,7 @@ class System:
     states: dict[str, str] = field(default_factory=dict)
     rates: dict[str, str] = field(default_factory=dict)
     masses: dict[str, str] = field(default_factory=dict)
-    force_unit: str = "N"
+    force_unit: str | None = None
     output: Callable[..., object] | None = None
     start: dict[str, float | str] = field(default_factory=dict)
     window: float | None = None
@@ -173,8 +174,8 @@ class System:
                 if n not in self.states:
                     raise wrong(f"rates: {n!r} is not a state; states are {', '.join(self.states)}")
         for v, m in self.masses.items():
-            if v not in self.rates:
-                raise wrong(f"masses: {v!r} is not a velocity of rates")
+            if v not in self.speeds:
+                raise wrong(f"masses: {v!r} is no velocity: not of rates, nor in a unit of one")
             if m not in names:
                 raise wrong(f"masses: {m!r} is not a parameter; parameters are {', '.join(names)}")
         for s, begin in self.start.items():
@@ -214,6 +215,17 @@ class System:
                 if place not in known:
                     allowed = ", ".join(sorted(known))
                     raise wrong(f"law {law.name!r}: places: {place!r} is not known; allowed: {allowed}")
+
+    @property
+    def speeds(self) -> list[str]:
+        """States that are velocities: those of ``rates``, and those whose unit says so."""
+        return [n for n, unit in self.states.items() if n in self.rates or kind_of(unit).endswith("velocity")]
+
+    def unit_of_force(self, state: str) -> str:
+        """The unit of what drives a velocity: of a force or torque where it has a mass, else of its derivative."""
+        if state not in self.masses:
+            return f"({self.states[state]})/s"
+        return self.force_unit or ("N m" if kind_of(self.states[state]) == "angular velocity" else "N")
 
     def channels(self) -> tuple[str, ...]:
         """Names that a log must have."""
