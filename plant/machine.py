@@ -14,7 +14,8 @@ from plant.effect import T_REF, Parameter
 from plant.effects import EFFECTS, ROW, states_of
 from plant.geometry import Geometry, Schedules, load_schedules
 from plant.linkage import G_L, G_LDP, N_CRANK, N_PER_STAGE
-from plant.parameters import GEOMETRY, AnyPlantTable, Nominal, Supply, derive, load_plant, nominal
+from plant.parameters import GEOMETRY, LINE_CONDUCTANCE, AnyPlantTable, Nominal, Supply, derive, load_plant, nominal
+from plant.places import AERO_LOAD
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import own_rows, same_stages
 
@@ -51,6 +52,28 @@ class Plant:
         """Refuse a machine with two actuators: InputError in one line, for ``what`` takes one alone."""
         if self.sides != 1:
             raise InputError(f"plant table: actuators.number (={self.sides}) must be 1 for {what} (docs/machines.md)")
+
+    @property
+    def one_valve(self) -> bool:
+        """Whether both of its actuators hang on one valve."""
+        return bool(self.p[LINE_CONDUCTANCE, 0] != 0.0)
+
+    @property
+    def share_of_load(self) -> float:
+        """What each of its pistons has of the air's load."""
+        return 1.0 / self.sides
+
+    def alone(self, side: int) -> Plant:
+        """One of two actuators (0 A, 1 B) with its share of the air's load and no rings: a lane of its own."""
+        p = np.ascontiguousarray(self.p[:, side : side + 1])
+        p[AERO_LOAD] *= self.share_of_load
+        return replace(self, p=p)
+
+    def nominal_of(self, n: Nominal, side: int) -> float:
+        """Value of a nominal parameter at one of two actuators (0 A, 1 B), in its table's unit."""
+        own = getattr(self.table, "actuators", None) if side else None
+        given = getattr(own.b, n.name.split(".")[1], None) if own is not None else None
+        return n.value if given is None else float(given.value)
 
     @property
     def usual(self) -> dict[str, float]:

@@ -45,7 +45,7 @@ from plant.effects import EFFECTS
 from plant.geometry import Stage
 from plant.layout import MOST_CURVES, PLAY
 from plant.machine import Plant, build_plant
-from plant.parameters import LINE_CONDUCTANCE, Nominal, derive
+from plant.parameters import Nominal, derive
 from vaneloop.base.curve import DEGREE, FINE_SIDE, POINTS, SIDE, splines
 from vaneloop.base.durations import named_lag, period_of
 from vaneloop.base.errors import InputError
@@ -56,8 +56,12 @@ from vaneloop.base.hysteresis import stops_of
 from vaneloop.base.tables import Bound, Finite, Table, read
 from vaneloop.base.vanes import MOST, VANES, vane_in
 
-__all__ = ["Learned", "Model", "allowed_of", "load_model", "text_of", "write_model"]
+__all__ = [
+    "SIDE_NAMES", "Learned", "Model", "Side", "allowed_of", "load_model", "of_a_side", "side_of", "text_of",
+    "write_model",
+]  # fmt: skip
 
+SIDE_NAMES = ("side_a", "side_b")  # of two actuators
 FAR = 4.0  # tolerances: a nominal parameter farther off is not recalibrated, something else is wrong
 
 
@@ -253,7 +257,7 @@ class Model(Table):
     @property
     def sides(self) -> dict[str, Side]:
         """What one of two actuators has that both have not, of those that have such a thing; side A's first."""
-        sides = {"side_a": self.side_a, "side_b": self.side_b}
+        sides = dict(zip(SIDE_NAMES, (self.side_a, self.side_b), strict=True))
         return {name: side for name, side in sides.items() if side.parameters or side.effects}
 
     def check(self, plant: Plant, source: str | Path = "model") -> None:
@@ -265,9 +269,9 @@ class Model(Table):
         for name, side in self.sides.items():
             if plant.sides != 2:
                 raise InputError(f"{source}: {name}: this machine has one actuator")
-            one_valve = bool(plant.p[LINE_CONDUCTANCE, 0] != 0.0)
+            one_valve = plant.one_valve
             for key in (*side.parameters, *side.effects):
-                if not _of_a_side(key, one_valve):
+                if not of_a_side(key, one_valve):
                     allowed = "actuator and LVDT" if one_valve else "valve, actuator and LVDT"
                     but = "aero_load, flow gain and area" if one_valve else "aero_load"
                     raise InputError(
@@ -354,7 +358,7 @@ class Model(Table):
         p = machine.p.copy()
         self._put(p, machine, self)
         for name, side in self.sides.items():
-            lane = ("side_a", "side_b").index(name)
+            lane = SIDE_NAMES.index(name)
             self._put(p[:, lane : lane + 1], machine, side)
         derive(p, chain.TICK / chain.SUBSTEPS, chain.TICK)
         if not np.isfinite(p).all():
@@ -379,7 +383,13 @@ class Model(Table):
                 p[row] = values.get(parameter.name, parameter.neutral) * parameter.si
 
 
-def _of_a_side(name: str, one_valve: bool) -> bool:
+def side_of(name: str) -> tuple[str, str]:
+    """Split a name such as ``side_b.lvdt_bias`` into its side and what it names; "" and the name where it has none."""
+    side, _, rest = name.partition(".")
+    return (side, rest) if side in SIDE_NAMES else ("", name)
+
+
+def of_a_side(name: str, one_valve: bool) -> bool:
     """Whether a parameter or an effect can be that of one of two actuators, with a valve each or with one."""
     own = ("actuator", "lvdt") if one_valve else ("valve", "actuator", "lvdt")
     if name in EFFECTS:

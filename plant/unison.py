@@ -57,7 +57,7 @@ from plant.parameters import GEOMETRY, POT_SHIFT, RING_STIFFNESS, VANE_COUNT
 from plant.places import X
 from vaneloop.base.compiled import in_place, inlined
 
-__all__ = ["Tie", "energy", "forces", "ring_at", "tie", "unjoined"]
+__all__ = ["Tie", "energy", "forces", "ring_at", "shared", "tie", "unjoined"]
 
 
 class Tie(NamedTuple):
@@ -133,6 +133,14 @@ def forces(t: Tie, w_a: float, w_b: float, c_a: float, c_b: float) -> tuple[floa
 
 
 @inlined
+def shared(theta_a: float, theta_b: float, shift: float) -> tuple[float, float]:
+    """Return the angle (rad) of a ring that A alone would turn to ``theta_a`` and B to ``theta_b``, and what its
+    potentiometer's place adds: ``shift`` = 1/2 cos phi of their difference.
+    """
+    return 0.5 * (theta_a + theta_b), shift * (theta_a - theta_b)
+
+
+@inlined
 def ring_at(s: np.ndarray, p: np.ndarray, j: int, d: Any, theta: float) -> tuple[float, float]:
     """Return the angle (rad) of a ring that actuator A alone would turn to ``theta``, the mean of both, and what its
     potentiometer's place adds.
@@ -140,8 +148,7 @@ def ring_at(s: np.ndarray, p: np.ndarray, j: int, d: Any, theta: float) -> tuple
     d  of the ring's stage, `plant.stem.prepare`
     """
     c, e = _crank(s, p, j, j + 1)
-    other = ring_angle(c, e, d.ax, d.ay, d.lb, d.lc, d.ld)
-    return 0.5 * (theta + other), p[POT_SHIFT, j] * (theta - other)
+    return shared(theta, ring_angle(c, e, d.ax, d.ay, d.lb, d.lc, d.ld), p[POT_SHIFT, j])
 
 
 @in_place

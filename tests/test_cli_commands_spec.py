@@ -448,7 +448,7 @@ def test_what_the_search_finds_is_printed(ran: Ran, log: str, monkeypatch: pytes
     modules = (compare, diagnose, experiment, extend, learn, locate)
     for m in modules:
         monkeypatch.setattr(
-            m, "chain_of", lambda args, model=None, loop=False: asked.append(("chain", loop)) or chain()
+            m, "chain_of", lambda args, model=None, loop=False, alone="": asked.append(("chain", loop)) or chain()
         )
     monkeypatch.setattr(
         "vaneloop.cli.replay.replayed", lambda args, *more: asked.append(("replayed", args.report, more)) or 0
@@ -1265,8 +1265,9 @@ def test_a_log_is_put_into_the_subsystems_of_a_machine(log: str, ran: Ran, monke
     assert chains.chain_of(args, loop=True).notes == ["a note"] and asked[1] == "warm"
     assert asked[0] == asked[2] == chains.split(["0:5", "6:9"], ["9:"])[:2]
     args.plant = "plant_two_actuators.toml"
-    with pytest.raises(Exception, match="judging subsystems"):
-        chains.chain_of(args)
+    assert chains.chain_of(args).notes == ["a note"]
+    with pytest.raises(Exception, match=r"actuators\.number \(=2\) must be 1 for learning"):
+        chains.chain_of(args, alone="learning")
 
 
 def test_what_else_is_in_a_log_is_told(ran: Ran, log: str, monkeypatch: pytest.MonkeyPatch) -> None:

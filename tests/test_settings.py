@@ -25,6 +25,7 @@ LAYOUT = {
     "unmodelled/curve_candidates.py": {"JUMP"},  # index of an amplitude that is of no function of the basis
     "unmodelled/fitted_candidate.py": {"MEASURED"},  # rank in an order
     "unmodelled/spectral_lines.py": {"ALONE"},  # one harmonic, beside the threshold of a line
+    "vane_chain/parameters.py": {"BOTH"},  # a code, beside the numbers of two sides
 }  # fmt: skip
 
 

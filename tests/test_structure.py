@@ -210,7 +210,7 @@ EXPORTS: dict[str, list[str]] = {
         "rows_at",
         "states_of",
     ],
-    "plant.stages": ["actuator_run", "engine_run", "linkage_run", "run_bends", "step_currents"],
+    "plant.stages": ["actuator_run", "engine_run", "linkage_run", "ring_loads", "run_bends", "step_currents"],
     "vaneloop": [
         *(
             "Channel",

@@ -18,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
+import vaneloop
 from controller.calibration import CalibrationTable
 from hil.fmu import write_fmu
 from hil.logs import read_log
@@ -37,7 +38,6 @@ from vaneloop.base.tables import path, read
 from vaneloop.cli.main import COMMANDS, main
 from vaneloop.design.servo_motor import plant_of_tables
 from vaneloop.fleet.plan import model_of
-from vaneloop.identification.vane_chain.chain import build_chain
 from vaneloop.verbs.machine import Machine
 
 TABLE = "plant_two_actuators.toml"
@@ -377,7 +377,10 @@ SHORT = ("--bus", "lockstep", "--duration", "1")
 WORKS = {  # what it does with two actuators
     "engine-test": (),
     "replay": (LOG,),
-    "compare": (LOG,),  # the loop; why there is no comparison by subsystem is said
+    "compare": (LOG,),
+    "locate": (LOG,),
+    "diagnose": (LOG,),
+    "extend": (LOG, "--effect", "linkage_backlash", "--out", "x.toml"),
     "run": SHORT,
     "inject": ("demand_stops",),
     "strategies": (),
@@ -386,11 +389,8 @@ WORKS = {  # what it does with two actuators
     "a2l": (),  # of the firmware
 }
 REFUSED = {
-    "diagnose": (LOG,),
-    "locate": (LOG,),
     "learn": (LOG,),
     "experiment": (LOG,),
-    "extend": (LOG, "--effect", "valve_dead_band", "--out", "x.toml"),
     "design": (),
     "export-fmu": ("--part", "plant", "--out", "x.fmu"),
     "fleet": ("run", LOG, "--out", "run"),
@@ -430,7 +430,8 @@ def test_a_command_that_cannot_take_two_actuators_says_so_in_one_line(
 def test_a_command_that_simulates_takes_two_actuators(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([name, *WORKS[name], "--plant", TABLE]) == 0
     said = capsys.readouterr()
-    assert ("no comparison by subsystem" in said.out + said.err) == (name == "compare")
+    assert "no comparison by subsystem" not in said.out + said.err
+    assert ("which actuator or LVDT is at fault cannot be told" in said.out + said.err) == (name == "compare")
 
 
 def test_the_library_refuses_what_the_commands_refuse(tmp_path: Path) -> None:
@@ -440,7 +441,8 @@ def test_the_library_refuses_what_the_commands_refuse(tmp_path: Path) -> None:
             tmp_path / "x.fmu", "plant", TWO, machine.calibration, read("calibration.toml", CalibrationTable)
         ),
         lambda: plant_of_tables(TABLE),
-        lambda: build_chain(read_log("examples/hidden_effect.parquet"), TWO, machine.calibration),
+        lambda: vaneloop.learn("examples/hidden_effect.parquet", machine),
+        lambda: vaneloop.experiment("examples/hidden_effect.parquet", machine),
     ):
         with pytest.raises(InputError, match=r"actuators\.number \(=2\) must be 1 "):
             refused()

@@ -32,12 +32,12 @@ from vaneloop.identification.vane_chain import candidates, demand, experiment, h
 from vaneloop.identification.vane_chain.actuator import _quadratic_drag
 from vaneloop.identification.vane_chain.alignment import (
     Late,
-    _explains,
     _servo,
     _shifted,
     aligned,
     demand_of,
     driving,
+    explains,
     late_in_controller,
     late_vanes,
     on_rows,
@@ -285,17 +285,17 @@ def test_a_late_channel_is_put_where_it_belongs() -> None:
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "explains"),
+    ("before", "after", "holds"),
     [
         ([5.0, 3.0], [2.9, 2.0], True), ([5.0, 3.0], [3.1, 2.0], False), ([5.0, 3.0], [1.0, 3.1], False),
         ([5.0, 0.5], [1.0, 0.5], True), ([5.0], [3.0], True), ([1.0], [1.0], False),
     ],
 )  # fmt: skip
 def test_a_clock_explains_what_gets_better_everywhere_and_by_half(
-    chain: Chain, before: list[float], after: list[float], explains: bool
+    chain: Chain, before: list[float], after: list[float], holds: bool
 ) -> None:
     stage = chain.stage("linkage")
-    assert _explains(stage, np.array([*before, 1.0, 1.0])[:3], np.array([*after, 1.0, 1.0])[:3]) == explains
+    assert explains(stage, np.array([*before, 1.0, 1.0])[:3], np.array([*after, 1.0, 1.0])[:3]) == holds
 
 
 def test_a_clock_must_gain_as_many_nats_as_an_effect(chain: Chain) -> None:
@@ -303,7 +303,7 @@ def test_a_clock_must_gain_as_many_nats_as_an_effect(chain: Chain) -> None:
     per_output = np.isfinite(stage.measured).sum(axis=1)
     enough = 2.0 * COLOUR[1] * NATS / per_output.sum()
     fits = np.full(3, 0.9)  # below the floor, whose level is no evidence
-    assert _explains(stage, fits, fits - 1.01 * enough) and not _explains(stage, fits, fits - 0.99 * enough)
+    assert explains(stage, fits, fits - 1.01 * enough) and not explains(stage, fits, fits - 0.99 * enough)
 
 
 # ---- the current between rows ----------------------------------------------------------------------------------------
@@ -452,7 +452,9 @@ def interval(low: float, high: float) -> dict[str, float]:
 
 def test_laws_that_are_also_something_else_are_said_by_their_sizes() -> None:
     sharp, round_end = ({"valve_flow_saturation": {"roundness": interval(0.0, r)}} for r in (0.5, 1.0))
-    assert _quadratic_drag(sharp) == "" and _quadratic_drag(round_end).startswith("a drag that grows")
+    which = "valve_flow_saturation"
+    assert _quadratic_drag(which, sharp) == ""
+    assert _quadratic_drag(which, round_end).startswith("a drag that grows")
     lags = {"pot_lag": {"vigv": interval(0.02, 0.04), "vgv1": interval(0.03, 0.05)}}
     assert _late_recorder(lags) == "a recorder of the vanes that is late"
     lags["pot_lag"]["vgv1"] = interval(0.041, 0.05)

@@ -14,5 +14,6 @@ from plant.stages.bends import run_bends
 from plant.stages.currents import step_currents
 from plant.stages.engine import engine_run
 from plant.stages.linkage import linkage_run
+from plant.stages.rings import ring_loads
 
-__all__ = ["actuator_run", "engine_run", "linkage_run", "run_bends", "step_currents"]
+__all__ = ["actuator_run", "engine_run", "linkage_run", "ring_loads", "run_bends", "step_currents"]

@@ -8,7 +8,7 @@ from plant import chain, curve
 from plant.chain import bent_reading, measured_stroke, straightened, true_stroke
 from plant.curve_lanes import alike
 from plant.effects import CURVES, aero_load
-from plant.parameters import DRIVE_EFFECTS, KIND, LVDT_FACTOR, LVDT_LAG, LVDT_SHARE, VALVE_SHARE
+from plant.parameters import ACTUATORS, DRIVE_EFFECTS, KIND, LVDT_FACTOR, LVDT_LAG, LVDT_SHARE, VALVE_SHARE
 from plant.places import AERO_LOAD, LVDT_LAG_ERROR, READING, SCREW_PITCH_ERROR, VALVE_LAG, X_LVDT, X
 from plant.stages import hydraulic_blocks, motor_blocks
 from plant.stages.blocks import NOTHING, W, between, in_blocks, on_all_cores, parts_of
@@ -31,6 +31,7 @@ def actuator_run(
     x_lvdt: np.ndarray | None = None,
     window: int = 0,
     known: np.ndarray = NOTHING,
+    pushed: np.ndarray = NOTHING,
 ) -> None:
     """Fill out[k, lane] with the stroke (m) as the LVDT gives it at sample k, without noise. ``s`` is moved on.
 
@@ -41,6 +42,8 @@ def actuator_run(
                       saw it, so that a small error of speed does not carry it away; without them it starts from ``s``
                       and runs free
     known             signals of curves (`plant.curve.take`); the current's is that of every step
+    pushed            float64[lanes, samples] N against extension: of one of two actuators, what the rings do to its
+                      piston (`plant.stages.ring_loads`); its ``p`` has its share of the air's load. None: no rings
 
     The lags' shares in ``p`` are set to h / (h + tau): over long steps h this keeps the delay of a ramp exact, where
     the share of a constant input, 1 - exp(-h / tau), would be early by h / 2.
@@ -61,7 +64,8 @@ def actuator_run(
     need = np.zeros(p.shape[1]) if motor else hydraulic_blocks.costs(p)
     needed = np.empty((0, 0)) if motor else hydraulic_blocks.needs(p)
     order = np.lexsort((need, p[SCREW_PITCH_ERROR] != 0.0, curved, alone))
-    wide = in_blocks(p.shape[1] - np.count_nonzero(alone), W, FEW)
+    # the chain joins both of two actuators; here one is alone
+    wide = in_blocks(p.shape[1] - np.count_nonzero(alone), W, FEW if p[ACTUATORS, 0] == 0.0 else 0)
 
     def run(part: range) -> None:
         some = order[part.start : part.stop]
@@ -70,7 +74,9 @@ def actuator_run(
             motor_blocks.run(current, n_r, t_oil, dt, p, s, out.T, x, window, some, block, known)
         elif part.start < wide:
             block = np.empty(1, hydraulic_blocks.BLOCK)
-            hydraulic_blocks.run(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, block, known, needed)
+            hydraulic_blocks.run(
+                current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, block, known, needed, pushed
+            )
         else:
             _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, known)
 

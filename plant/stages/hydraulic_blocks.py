@@ -79,9 +79,11 @@ def run(
     block: np.ndarray,
     known: np.ndarray,
     needed: np.ndarray,
+    pushed: np.ndarray,
 ) -> None:
     """The lanes of ``order``, eight at a time; out[lane, k]. ``block``: memory for one record `BLOCK`; ``known``:
-    signals of curves (`plant.curve.take`); ``needed``: what each lane of ``p`` `needs`.
+    signals of curves (`plant.curve.take`); ``needed``: what each lane of ``p`` `needs`; ``pushed``: loads beside the
+    air's (`plant.stages.actuator.actuator_run`).
     """
     n, substeps = current.shape
     h = dt / substeps
@@ -122,6 +124,9 @@ def run(
                     for j in range(W):
                         b.load[j] = b.bare_load[j] = drive.load_of(_drive(b, j), speed)
                         b.half_share[j] = drive.half_share(_drive(b, j), supply)
+                    if pushed.shape[0] > 0:
+                        for j in range(W):
+                            b.load[j] += between(pushed[order[j0 + min(j, last - 1)]], k)
                 else:
                     for j in range(W):
                         b.root[j] = drive.root(_drive(b, j), supply)

@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from plant import chain, curve, lanes, linkage_lanes, lvdt, stem
+from plant import chain, curve, lanes, linkage_lanes, lvdt, stem, unison
 from plant.chain import straightened, true_stroke
 from plant.curve_lanes import alike, first_curved, gives, site_of, tables_of
 from plant.effects import CURVES, pot_lag
 from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank
-from plant.parameters import GEOMETRY, LVDT_LAG, POT_LAG
+from plant.parameters import GEOMETRY, LVDT_LAG, POT_LAG, POT_SHIFT
 from plant.places import LINKAGE_FRICTION, LVDT_LAG_ERROR, POT, POT_LAG_ERROR, RING_ECCENTRICITY, X
 from plant.stages.blocks import NOTHING, in_blocks, on_all_cores, parts_of
 from vaneloop.base.compiled import compiled_free, inlined
 
-__all__ = ["linkage_run", "speed_reach"]
+__all__ = ["linkage_run", "speed_of", "speed_reach"]
 
 WIDE = 16  # lanes in a block: more are no quicker each, and fewer sets than a block's lanes fill it badly
 SOME = 1  # so few lanes or fewer are quicker one by one
@@ -34,6 +34,8 @@ def linkage_run(
     s: np.ndarray,
     out: np.ndarray,
     known: np.ndarray = NOTHING,
+    x_b: np.ndarray | None = None,
+    p_b: np.ndarray = NOTHING,
 ) -> None:
     """Fill out[k, stage, lane] with the vane angle (rad) as its potentiometer gives it at sample k, without noise.
     ``s`` is moved on.
@@ -43,23 +45,23 @@ def linkage_run(
     n_r, t_oil, t   %, degC, s from the start of the log
     out      quickest where a lane's samples lie side by side in memory
     known    signals of curves (`plant.curve.take`)
+    x_b, p_b  of two actuators, whose A the stroke and ``p`` then are: B's stroke (m), and its parameters, a lane of B
+              for each of A
     """
     x_lvdt = np.ascontiguousarray(x_lvdt)
-    reach = speed_reach(dt)
-    ahead, behind = (
-        np.minimum(np.arange(len(x_lvdt)) + reach, len(x_lvdt) - 1),
-        np.maximum(np.arange(len(x_lvdt)) - reach, 0),
-    )
-    speed = (x_lvdt[ahead] - x_lvdt[behind]) / (np.maximum(ahead - behind, 1) * dt)
+    speed = speed_of(x_lvdt, dt)
+    two = x_b is not None
+    b_too = x_lvdt[:0] if x_b is None else np.ascontiguousarray(x_b)
+    b_speed = speed_of(b_too, dt) if two else b_too
     curved = p[CURVES] != 0.0
     alone = curved & ~alike(p)
     # what one lane of a block needs is computed for all of them: those that need the same are put side by side
     stages = range(out.shape[1])
     rubbed = (p[[LINKAGE_FRICTION + k for k in stages]] != 0.0).any(axis=0)
     eccentric = (p[[RING_ECCENTRICITY + k for k in stages]] != 0.0).any(axis=0)
-    bent = np.array([lvdt.bends(p, j) for j in range(p.shape[1])])
+    bent = np.array([lvdt.bends(p, j) or (two and lvdt.bends(p_b, j)) for j in range(p.shape[1])])
     order = np.lexsort((eccentric, rubbed, bent, curved, alone))
-    wide = in_blocks(p.shape[1] - np.count_nonzero(alone), WIDE, SOME)
+    wide = in_blocks(p.shape[1] - np.count_nonzero(alone), WIDE, 0 if two else SOME)  # the chain has B in the next lane
     to = out.transpose(2, 1, 0)
     to = to if to.flags.c_contiguous else np.empty(to.shape)
 
@@ -67,13 +69,23 @@ def linkage_run(
         some = order[part.start : part.stop]
         if part.start < wide:
             block = np.empty(1, _linkage(out.shape[1]))
-            _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, to, some, block, known)
+            _linkage_blocks(x_lvdt, speed, n_r, t_oil, t, dt, p, s, to, some, block, known, b_too, b_speed, p_b)
         else:
             _linkage_lanes(x_lvdt, speed, n_r, t_oil, t, dt, p, s, to, some, known)
 
     on_all_cores(run, parts_of(p.shape[1], wide, WIDE))
     if not np.may_share_memory(to, out):
         out[...] = to.transpose(2, 1, 0)
+
+
+def speed_of(x_lvdt: np.ndarray, dt: float) -> np.ndarray:
+    """Speed (m/s) of a measured stroke (m)."""
+    reach = speed_reach(dt)
+    ahead, behind = (
+        np.minimum(np.arange(len(x_lvdt)) + reach, len(x_lvdt) - 1),
+        np.maximum(np.arange(len(x_lvdt)) - reach, 0),
+    )
+    return np.asarray((x_lvdt[ahead] - x_lvdt[behind]) / (np.maximum(ahead - behind, 1) * dt))
 
 
 def speed_reach(dt: float) -> int:
@@ -134,7 +146,8 @@ def _linkage_lanes(
 _BENT = ("lvdt_adds", "lvdt_times", "crank_adds")
 _BENT_OF_STAGE = ("ring_adds", "play_adds", "pot_adds", "pot_times")
 _OF_STAGE = (
-    (stem.StemState, stem.Stem), ("pot", "before", "theta", "e", "b", "lever", "span", "half", *_BENT_OF_STAGE),
+    (stem.StemState, stem.Stem),
+    ("pot", "before", "theta", "twist", "e", "b", "lever", "span", "half", *_BENT_OF_STAGE),
 )  # fmt: skip
 
 
@@ -142,7 +155,7 @@ _OF_STAGE = (
 def _linkage(stages: int) -> np.dtype[np.void]:
     """Block for that many stages: the compiler knows how often its loops over them go."""
     # late: s, by which the LVDT trails the stroke
-    more = ("late", "stroke", "c", "d", *_BENT)
+    more = ("late", "stroke", "c", "d", "c_b", "d_b", "shift", *_BENT)
     return lanes.block(WIDE, linkage_lanes.Crank, lvdt.Lvdt, more=more, each=(stages, *_OF_STAGE))
 
 
@@ -166,8 +179,14 @@ def _linkage_blocks(
     order: np.ndarray,
     block: np.ndarray,
     known: np.ndarray,
+    x_b: np.ndarray,
+    speed_b: np.ndarray,
+    p_b: np.ndarray,
 ) -> None:
-    """The lanes of ``order``, `WIDE` at a time; out[lane, stage, m]. ``block``: memory for one record `_linkage`."""
+    """The lanes of ``order``, `WIDE` at a time; out[lane, stage, m]. ``block``: memory for one record `_linkage`; with
+    ``x_b`` the rings have an actuator B, too.
+    """
+    two = len(x_b) > 0
     g = GEOMETRY
     b = block[0]
     for j0 in range(0, len(order), WIDE):
@@ -178,7 +197,7 @@ def _linkage_blocks(
             _put_crank(
                 b, j, linkage_lanes.crank_numbers(p[g + G_LX0, q], p[g + G_X1, q], p[g + G_Y1, q], p[g + G_LE, q])
             )
-            b.late[j] = max(p[LVDT_LAG, q], 0.0) + p[LVDT_LAG_ERROR, q]
+            b.late[j], b.shift[j] = max(p[LVDT_LAG, q], 0.0) + p[LVDT_LAG_ERROR, q], p[POT_SHIFT, q]
             _put_lvdt(b, j, lvdt.prepare(p, q))
             bent |= lvdt.bends(p, q)
             for k in range(b.pot.shape[0]):
@@ -212,11 +231,23 @@ def _linkage_blocks(
             else:
                 for j in range(WIDE):
                     b.c[j], b.d[j] = linkage_lanes.crank(b.stroke[j], _crank(b, j))
+            if two:
+                for j in range(WIDE):
+                    q = order[j0 + min(j, last - 1)]
+                    late = max(p_b[LVDT_LAG, q], 0.0) + p_b[LVDT_LAG_ERROR, q]
+                    stroke = true_stroke(x_b[m] + late * speed_b[m], p_b, q, t_oil[m])
+                    b.c_b[j], b.d_b[j] = linkage_lanes.crank(stroke, _crank(b, j))
             for k in range(b.pot.shape[0]):
                 for j in range(WIDE):
                     b.theta[k, j] = linkage_lanes.ring_angle(
                         b.c[j], b.d[j], b.ax[k, j], b.ay[k, j], b.lb[k, j], b.span[k, j], b.half[k, j]
                     )
+                if two:
+                    for j in range(WIDE):
+                        theta_b = linkage_lanes.ring_angle(
+                            b.c_b[j], b.d_b[j], b.ax[k, j], b.ay[k, j], b.lb[k, j], b.span[k, j], b.half[k, j]
+                        )
+                        b.theta[k, j], b.twist[k, j] = unison.shared(b.theta[k, j], theta_b, b.shift[j])
                 if eccentric:
                     for j in range(WIDE):
                         b.theta[k, j] = stem.drive(_stem(b, k, j), b.theta[k, j], n_r[m], t_oil[m], t[m], True)
@@ -234,6 +265,9 @@ def _linkage_blocks(
                     _follow(b, k, t_oil[m], t[m], True, False)
                 else:
                     _follow(b, k, t_oil[m], t[m], False, False)
+                if two:
+                    for j in range(WIDE):
+                        b.theta[k, j] += b.twist[k, j]
                 if first >= 0:
                     _read(b, k, m, t_oil[m], t[m], True)
                 else:

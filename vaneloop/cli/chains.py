@@ -22,15 +22,17 @@ def tell_search(say: Callable[[str], None]) -> None:
         say("compiling the subsystems of the search for this machine (once, about 30 s) ...")
 
 
-def chain_of(args: argparse.Namespace, model: Any = None, loop: bool = False) -> Any:
+def chain_of(args: argparse.Namespace, model: Any = None, loop: bool = False, alone: str = "") -> Any:
     """Read the log that ``args`` name and put it into stages of the machine that ``model`` (default: ``args.model``)
     describes.
 
     loop  the command simulates the whole loop, too: compiled first, where it is not
+    alone what the command does that takes a machine with one actuator alone; "": it takes two
     """
     machine = options.machine_of(args, model)
+    if alone:
+        machine.plant.of_one_actuator(alone)
     if not loop:
-        machine.plant.of_one_actuator("judging subsystems")
         machine.calibration.of_one_channel("judging subsystems")
     own_parts = split([x for group in getattr(args, "fit", ()) for x in group], options.parts_to_test(args))[:2]
     log = options.read_log_of(args, require=())

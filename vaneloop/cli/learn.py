@@ -64,7 +64,7 @@ def command(args: argparse.Namespace) -> int:
         check(path)
     checked_shape(args.shape)
     own, asked = own_model.asked(args), {"shape": args.shape, "formulas": not args.curve}
-    chain: Any = None if own else not_given(chain_of(args), args.without)
+    chain: Any = None if own else not_given(chain_of(args, alone="learning"), args.without)
     with terminal.progress_bar(args, "learning an unmodelled law") as tell:
         if own:
             answer = own_model.ask(args, "learn", without=args.without, **asked, progress=tell)

@@ -88,6 +88,8 @@ class Effect:
     excites     what a log needs to show it, in words
     holds       effects that it is at some values of its parameters: (name, a number for each parameter that is fixed,
                 NaN where any will do, None for each that is the other's, in order)
+    family      name of the effect that several places of the machine may have: of its members one stands in place of
+                another, and where each place names its own of the same size, all have it; "": it is of one place
     onward      function from the parameters of the one that it holds to starts that do nearly the same, farther and
                 farther from it; None: its own starts will do
     """
@@ -98,6 +100,7 @@ class Effect:
     excites: str = ""
     holds: tuple[tuple[str, tuple[float | None, ...]], ...] = ()
     onward: Callable[[Sequence[float]], list[tuple[float, ...]]] | None = None
+    family: str = ""
 
 
 @dataclass(eq=False)

@@ -262,6 +262,7 @@ def learn(
     tell, shape = progress or (lambda _: None), checked_shape(shape)
     if not isinstance(model, System):
         machine = model or Machine()
+        machine.plant.of_one_actuator("learning")
         chain, name = chain_for(log, machine, fit, test)
         return learned(not_given(chain, without), name, machine.added, workers, tell, None, shape, formulas)
     found = diagnose(log, model, fit=fit, test=test, added=added, without=without, progress=lambda f: tell(0.5 * f))

@@ -111,9 +111,11 @@ class Machine:
 
         Raises LogError for a log that shows none of them.
         """
+        from vaneloop.identification.vane_chain.chain import with_mean_stroke
         from vaneloop.identification.vane_chain.resample import grid_of
         from vaneloop.verbs.long import LONG, excerpted
 
+        log = with_mean_stroke(log, self.plant)
         grid = grid_of(log)
         return excerpted(log, grid, self.stages_of) if grid.rows > LONG else self.stages_of(log, grid)
 
@@ -124,7 +126,8 @@ class Machine:
         """`bind` of some rows of a log, as `build_chain` takes them; default: of all."""
         from vaneloop.identification.vane_chain.chain import build_chain
 
-        present = tuple(self.added.effects)
+        sides = [f"{side}.{effect}" for side, of in self.added.sides.items() for effect in of.effects]
+        present = (*self.added.effects, *sides)
         chain = build_chain(log, self.plant, self.calibration, present, grid, pieces, draws, late)
         if not chain.stages:
             why = "; ".join(f"{k}: {v}" for k, v in chain.not_observed.items())

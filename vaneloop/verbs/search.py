@@ -19,6 +19,7 @@ from hil.logs.notes import counted, told
 from plant import write_model
 from plant.curve import PLACES
 from plant.effects import EFFECTS
+from plant.model import SIDE_NAMES, Side, of_a_side, side_of
 from vaneloop.base.errors import InputError
 from vaneloop.base.signals import heading
 from vaneloop.identification import Record, StageError, System
@@ -661,7 +662,7 @@ def _close(name: str, known: Sequence[str]) -> str:
 def known(effects: Sequence[str], option: str = "effect") -> None:
     """Refuse an effect that is not in the library; ``option``: by which it was given."""
     for name in effects:
-        if name not in EFFECTS:
+        if side_of(name)[1] not in EFFECTS:
             close = difflib.get_close_matches(name, EFFECTS, 1)
             hint = f"; probably {close[0]!r} is meant" if close else ""
             raise InputError(f"--{option} {name!r} is not in the library{hint}; docs/effects.md lists it")
@@ -672,11 +673,12 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
     started = time.perf_counter()
     laws = {name: law.now(before.effects.get(name, {})) for name, law in before.curves.items()}
     places: dict[str, list[str]] = {}  # effect -> the subsystems of this log that show it
-    for name in dict.fromkeys([*before.effects, *wanted]):
-        law = laws.get(name)
-        if law is None and (kind := chain.plant.kind) not in EFFECTS[name].kinds:
+    of_sides = [f"{side}.{name}" for side, of in before.sides.items() for name in of.effects]
+    for name in (x for asked in dict.fromkeys([*before.effects, *of_sides, *wanted]) for x in _forms(asked, chain)):
+        law, effect = laws.get(name), side_of(name)[1]
+        if law is None and (kind := chain.plant.kind) not in EFFECTS[effect].kinds:
             raise InputError(f"--effect {name}: not of an actuator of kind {kind} (docs/effects.md)")
-        shown = PLACES[f"{law.at} {law.how}"].stages if law else EFFECTS[name].stages
+        shown = PLACES[f"{law.at} {law.how}"].stages if law else _shown_by(name, chain)
         places[name] = [s for s in shown if any(s == c.name for c in chain.stages)]
         if not places[name] and (law or name in wanted):
             why = "; ".join(f"{s}: {chain.not_observed.get(s, CANNOT)}" for s in shown)
@@ -724,22 +726,52 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
     return Extended(bound, d, log, None, model, next(filter(None, map(no_better, results)), ""), held=held)
 
 
+def _forms(name: str, chain: Chain) -> tuple[str, ...]:
+    """The names by which the stages have an effect that was asked for: its own; of two actuators that have one each,
+    that of either side.
+    """
+    have = {e.name for s in chain.stages for e in s.effects}
+    of_sides = tuple(f"{side}.{name}" for side in SIDE_NAMES if f"{side}.{name}" in have)
+    return (name,) if name in have else of_sides or (name,)
+
+
+def _shown_by(name: str, chain: Chain) -> tuple[str, ...]:
+    """The subsystems that show an effect of the library, whether this log has them or not."""
+    side, effect = side_of(name)
+    if side and not (chain.plant.sides == 2 and of_a_side(effect, chain.plant.one_valve)):
+        raise InputError(f"--effect {name}: {effect} is not of one of two actuators of this machine (docs/machines.md)")
+    if chain.plant.sides == 1:
+        return EFFECTS[effect].stages
+    known = [s.name for s in chain.stages] + list(chain.not_observed)
+    having = {s.name for s in chain.stages if name in s.index()}
+    return tuple(
+        s for s in known if s in having or (s in chain.not_observed and s.split("_")[0] in EFFECTS[effect].stages)
+    )
+
+
 def with_fits(model: Model, results: Sequence[StageDiagnosis]) -> Model:
     """The model with effects and nominal parameters as stages of the vane chain were fitted; a curve of a law file is
     as it was learned, times its scale.
     """
-    parameters, effects = dict(model.parameters), dict(model.effects)
+    parts: dict[str, Model | Side] = {"": model, **dict(zip(SIDE_NAMES, (model.side_a, model.side_b), strict=True))}
+    parameters = {side: dict(part.parameters) for side, part in parts.items()}
+    effects = {side: dict(part.effects) for side, part in parts.items()}
     for r in results:
-        parameters |= {str(q["parameter"]): float(cast(float, q["value"])) for q in r.recalibrated}
+        for q in r.recalibrated:
+            side, name = side_of(str(q["parameter"]))
+            parameters[side][name] = float(cast(float, q["value"]))
         for f in r.effects:
+            side, name = side_of(f.effect)
             fitted = {k: float(cast(float, v["value"])) for k, v in f.parameters.items()}
             if learned := model.curves.get(f.effect):
                 law = learned.now(model.effects.get(f.effect, {}))
-                effects[f.effect] = {n: v * fitted[SCALE] for n, v in zip(law.numbers, law.values, strict=True)}
+                effects[side][name] = {n: v * fitted[SCALE] for n, v in zip(law.numbers, law.values, strict=True)}
             else:
-                own = [p.name for p in EFFECTS[f.effect].parameters]
-                effects[f.effect] = {k: v for k, v in fitted.items() if k in own}
-    return model.model_copy(update={"parameters": parameters, "effects": effects})
+                own = [p.name for p in EFFECTS[name].parameters]
+                effects[side][name] = {k: v for k, v in fitted.items() if k in own}
+    of = {side: {"parameters": parameters[side], "effects": effects[side]} for side in parts}
+    sides = {side: parts[side].model_copy(update=of[side]) for side in SIDE_NAMES}
+    return model.model_copy(update=of[""] | sides)
 
 
 def experiment(
@@ -783,7 +815,9 @@ def experiment(
     if isinstance(model, System):
         model = diagnose(log, model, fit=fit, test=test, added=added, progress=lambda f: tell(0.3 * f))
     elif not isinstance(model, Diagnosed):
-        model = diagnosed(*chain_for(cast("LogLike", log), model or Machine(), fit, test))
+        machine = model or Machine()
+        machine.plant.of_one_actuator("an experiment")
+        model = diagnosed(*chain_for(cast("LogLike", log), machine, fit, test))
     if model.by_log is None:
         best = recommend(model.diagnosis, progress, model.bound)
     else:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from plant import chain, places
-from plant.effects import oil_compressibility, piston_stiction
+from plant.drive import nominal_compliance
+from plant.effects import piston_stiction
 from plant.parameters import derive
-from plant.stages import actuator_run, step_currents
+from plant.places import AERO_LOAD
+from plant.stages import actuator_run, ring_loads, step_currents
+from plant.stages.blocks import NOTHING
 from vaneloop.identification.onset import that_begins
 from vaneloop.identification.settings import NEAR_STOP, RASTER, SIMPLER, SUBSTEPS, WINDOW
 from vaneloop.identification.subsystem import Array, Named, Stage, without_jumps
-from vaneloop.identification.vane_chain.parameters import declared, lanes, like_time
+from vaneloop.identification.vane_chain.parameters import declared_by_side, lanes_by_side, like_time
 from vaneloop.identification.vane_chain.resample import lately, rms
 from vaneloop.identification.vane_chain.subsystem_data import Driven, Made, excerpts
 
@@ -20,9 +25,15 @@ __all__ = ["actuator_stage"]
 
 @that_begins
 def actuator_stage(driven: Driven) -> Stage:
-    """Stroke from the current of every tick, started anew in each window."""
+    """Stroke from the current of every tick, started anew in each window.
+
+    That of one of two actuators feels the rings: their loads follow from both measured strokes (`plant.unison`).
+    """
     t, c, machine, _, outputs, run = driven[:6]
-    parameters, effects, rows, si = declared("actuator", driven)
+    of = declared_by_side("actuator", driven)
+    parameters, effects = of.parameters, of.effects
+    (own,) = outputs
+    side = driven.side
     signals = driven.signals()
     dt = float(t[1] - t[0])
     # the current of every tick, where it is known: its noise is dither to a valve with hysteresis or overlap
@@ -31,45 +42,53 @@ def actuator_stage(driven: Driven) -> Stage:
     others = np.ascontiguousarray(c["other_ticks"] * 1e-3) if "other_ticks" in c else i
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
     p_s, t_oil = np.ascontiguousarray(c["p_s"] * 1e6), np.ascontiguousarray(c["t_oil"])
-    x = np.ascontiguousarray(c["x_lvdt"] * 1e-3)
+    x = np.ascontiguousarray(c[own] * 1e-3)
+    both = None if side is None or driven.both is None else np.ascontiguousarray(np.array(driven.both) * 1e-3)
 
     logged = step_currents(i, dt, substeps)
 
     def simulate(thetas: Array, current: Array = logged, t_oil: Array = t_oil, p_s: Array = p_s) -> Array:
-        p = lanes(driven, thetas, rows, si)
+        each = lanes_by_side(driven, thetas, of)
+        p, pushed = each[side or 0], NOTHING
+        if side is not None:
+            p[AERO_LOAD] *= machine.share_of_load
+            pushed = NOTHING if both is None else ring_loads(both, t_oil, dt, each[0], each[1], side)
         derive(p, dt / current.shape[1], dt)
         s = np.zeros((chain.N_STATE, len(thetas)))
         s[places.X] = s[places.X_LVDT] = x[0]
         out = np.empty((len(thetas), 1, len(t)))
         known = driven.slipping(signals, p)
-        actuator_run(current, n_r, p_s, t_oil, dt, p, s, out[:, 0].T, x, int(round(WINDOW / dt)), known)
+        actuator_run(current, n_r, p_s, t_oil, dt, p, s, out[:, 0].T, x, int(round(WINDOW / dt)), known,
+                     pushed)  # fmt: skip
         out *= 1e3
         return out
 
     # a piston that leaned on a stop leaves it only when its chambers have turned their pressures round, which no
     # valve's curve tells
-    stroke = np.clip(c["x_lvdt"], 0.0, known_stroke := machine.table.actuator.stroke.value)
+    stroke = np.clip(c[own], 0.0, known_stroke := machine.table.actuator.stroke.value)
     leaning = np.minimum(stroke, known_stroke - stroke) < NEAR_STOP
     run = run & (leaning | ~lately(leaning, WINDOW, dt))
     measured = driven.measured(run)
-    stage = Stage("actuator", outputs, ("mm",), parameters, effects, simulate, t, measured, window=WINDOW)
+    stage = Stage(driven.name("actuator"), outputs, ("mm",), parameters, effects, simulate, t, measured, window=WINDOW)
     stage.finer = lambda thetas: simulate(thetas, step_currents(i, dt, 4 * substeps))
     ageing = like_time(t, t_oil)
     stage.twins = {name: ("time", lambda thetas: simulate(thetas, t_oil=ageing)) for name in ("oil_viscosity",)}
-    stage.alike = {"valve_flow_saturation": _quadratic_drag}
+    stage.alike = {driven.own("valve_flow_saturation"): partial(_quadratic_drag, driven.own("valve_flow_saturation"))}
     window = int(round(WINDOW / dt))
 
+    trapped = nominal_compliance(machine.p, side or 0)
     columns, other = stage.index(), step_currents(others, dt, substeps)
 
     def hidden(theta: Array) -> Array:
         out = simulate(theta[None])[0]
         between = rms(stage, out - simulate(theta[None], other)[0])
-        if "piston_stiction" not in columns or theta[columns["piston_stiction"].start] == 0.0:
+        stiction, soft = driven.own("piston_stiction"), driven.own("oil_compressibility")
+        if stiction not in columns or theta[columns[stiction].start] == 0.0:
             return between
-        excess, speed = theta[columns["piston_stiction"]] * (1.0, 1e-3)
-        give = oil_compressibility.NOMINAL
-        if "oil_compressibility" in columns:
-            give += 1e-6 * float(theta[columns["oil_compressibility"].start])  # mm/kN
+        excess, speed = theta[columns[stiction]] * (1.0, 1e-3)
+        give = trapped
+        if soft in columns:
+            give += 1e-6 * float(theta[columns[soft].start])  # mm/kN
         force = piston_stiction.scatter(np.gradient(without_jumps(stage, out[0])) * 1e-3 / dt, excess, speed)
         return np.hypot(between, 1e3 * give * float(np.sqrt(np.mean(force[np.isfinite(measured[0])] ** 2))))
 
@@ -99,9 +118,9 @@ def actuator_stage(driven: Driven) -> Stage:
     return stage
 
 
-def _quadratic_drag(named: Named) -> str:
+def _quadratic_drag(effect: str, named: Named) -> str:
     """A drag b v^2 takes b v^2 / A off the pressure drop of the orifices, so v = v0 / sqrt(1 + (v0 / limit)^2): an
     orifice in series, the round end of the saturation.
     """
-    round_end = float(named["valve_flow_saturation"]["roundness"]["high"]) >= 1.0 - 1e-6
+    round_end = float(named[effect]["roundness"]["high"]) >= 1.0 - 1e-6
     return "a drag that grows with the square of the speed" if round_end else ""

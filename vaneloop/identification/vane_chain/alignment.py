@@ -34,8 +34,8 @@ from vaneloop.identification.vane_chain.resample import Grid, first_row, last_di
 from vaneloop.identification.vane_chain.subsystem_data import VANES_LATE, Made
 
 __all__ = [
-    "Late", "LateIn", "aligned", "demand_of", "driving", "late_in_controller", "late_vanes", "on_rows", "passed_by",
-    "vanes_late",
+    "Late", "LateIn", "aligned", "demand_of", "driving", "explains", "late_in_controller", "late_vanes", "on_rows",
+    "passed_by", "vanes_late",
 ]  # fmt: skip
 
 Both = tuple[Array, Array]  # the mean of a row's ticks, and the last of them
@@ -167,7 +167,7 @@ def late_vanes(stages: Sequence[Stage]) -> LateIn:
         return {name: _shifted(t, c[name], by_clock(late)) for name in ("x_lvdt", "stroke", "n_r") if name in c}
 
     late, before, after = _fit(stage, _moving(stage, shifted), 2)
-    if not _explains(stage, before, after) or np.any(np.abs(late) >= LATE):
+    if not explains(stage, before, after) or np.any(np.abs(late) >= LATE):
         return {}
     if late[0] < 0.0 and "actuator" in of and _lvdt_lag(of["actuator"], -float(late[0])) > -0.5 * late[0]:
         return {}
@@ -356,7 +356,7 @@ def _fit(
     return offsets[k], before, errors[k]
 
 
-def _explains(stage: Stage, before: Array, after: Array) -> bool:
+def explains(stage: Stage, before: Array, after: Array) -> bool:
     """Whether no output gets worse, the gain is significant, and at least half of what they are above the noise goes;
     ``before`` and ``after``: mean squared errors of the outputs, in squared noise floors.
     """
@@ -407,7 +407,7 @@ def _one(
     found = []
     for behind in dict.fromkeys((AS_LOGGED, passed, passed._replace(held=bool(passed.kind)))):
         late, before, after = _fit(stage, _moving(stage, of, behind), 1, RASTER)
-        if _explains(stage, before, after) and allowed(float(late[0])) and abs(late[0]) < LATE:
+        if explains(stage, before, after) and allowed(float(late[0])) and abs(late[0]) < LATE:
             one = Late(channels, float(late[0]) - behind.delay, passed=behind._replace(late=-float(late[0])))
             found.append((float(after.sum()), one if behind.kind else Late(channels, float(late[0]))))
     return (min(found, key=lambda x: x[0])[1],) if found else ()

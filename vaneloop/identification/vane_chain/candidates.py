@@ -140,11 +140,13 @@ def with_laws(stage: Stage, laws: Sequence[str], curves: Sequence[tuple[Placed, 
 
 
 def without_laws(stages: Sequence[Stage], laws: Sequence[str]) -> list[Stage]:
-    """Stages of the vane chain that are not given some laws of the library."""
+    """Stages of the vane chain that are not given some laws of the library; one of both actuators is either side's,
+    too.
+    """
     out = []
     for stage in stages:
         have = [e.name for e in stage.effects]
-        rest = [name for name in have if name not in laws]
+        rest = [e.name for e in stage.effects if not {e.name, e.family} & {*laws}]
         out.append(stage if rest == have else remade(stage, rest, ()))
     return out
 

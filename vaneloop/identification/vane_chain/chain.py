@@ -17,7 +17,7 @@ causes is measured and added.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -34,7 +34,7 @@ from plant import Plant, build_plant
 from plant.curve import QUANTITIES
 from plant.effects import CURVES
 from plant.layout import C_OF, CURVE_ROWS, MOST_CURVES
-from vaneloop.base.signals import UNITS
+from vaneloop.base.signals import SIDES, UNITS
 from vaneloop.base.vanes import VANES, same_stages
 from vaneloop.identification.settings import (
     CHAIN_MEMORY,
@@ -74,9 +74,11 @@ from vaneloop.identification.vane_chain.engine import engine_stage
 from vaneloop.identification.vane_chain.hum import without_hum
 from vaneloop.identification.vane_chain.linkage import linkage_stage
 from vaneloop.identification.vane_chain.resample import (
+    OF_SIDES,
     OF_SUBSYSTEM,
     Gaps,
     Grid,
+    OfSubsystem,
     every_other,
     grid_of,
     last_digit,
@@ -89,17 +91,22 @@ from vaneloop.identification.vane_chain.resample import (
 )
 from vaneloop.identification.vane_chain.servo import servo_stage
 from vaneloop.identification.vane_chain.stationary_noise import expect_stationary_noise
-from vaneloop.identification.vane_chain.subsystem_data import SAMPLED_OF, STROKE_OFF, Driven
+from vaneloop.identification.vane_chain.subsystem_data import SAMPLED_OF, STROKE_OFF, Driven, stroke_of
+from vaneloop.identification.vane_chain.swapped import swapped
 
 __all__ = ["STAGE_ORDER", "Chain", "build_chain"]
 
+ACTUATORS = {"actuator": None, **{name: side for side, name in enumerate(OF_SIDES)}}  # whose of two each is
 BUS, DELAYS = {"n_dem", "n_r", "x_dem"}, ("can_delay", "frame_hold")  # channels in frames, and what delays frames
-STAGE_ORDER = tuple(OF_SUBSYSTEM)
+_LAST = "linkage"
+STAGE_ORDER = (*(name for name in OF_SUBSYSTEM if name != _LAST), *OF_SIDES, _LAST)
 MAKERS: dict[str, Callable[[Driven], Stage]] = {
     "demand": demand_stage,
     "servo": servo_stage,
     "engine": engine_stage,
     "actuator": actuator_stage,
+    "actuator_a": actuator_stage,
+    "actuator_b": actuator_stage,
     "linkage": linkage_stage,
 }
 
@@ -157,12 +164,14 @@ def build_chain(
     draws    of what the log hides from the servo
     late     what stands late in the log, where that is known; None: it is to be found
     """
-    log = without_hum(log)
+    log = without_hum(with_mean_stroke(log, plant or build_plant()))
     known = late or {}
     framed = any(c.framed for c in log.channels.values())  # frames are stamped by one clock
     chain = _build(log, plant, calibration, present, grid, pieces, draws, known)
     noisy = expect_stationary_noise(chain.stages) if late is not None or framed else []
-    for find in () if late is not None or framed else (late_in_controller, late_vanes):
+    known_clocks = late is not None or framed or chain.plant.sides > 1
+    noisy = expect_stationary_noise(chain.stages) if known_clocks else []
+    for find in () if known_clocks else (late_in_controller, late_vanes):
         found = find(chain.stages)
         if found:
             known = {**known, **{name: known.get(name, ()) + more for name, more in found.items()}}
@@ -172,9 +181,41 @@ def build_chain(
                 _hides_no_less(stage, hidden.get(stage.name))
         if found or find is late_in_controller:
             noisy = expect_stationary_noise(chain.stages)
-    chain.notes += _moved(known) + noisy
+    chain.notes += _moved(known) + noisy + _one_stroke(log, chain.plant) + swapped(chain.stages)
     chain.late = known
     return chain
+
+
+def with_mean_stroke(log: Log, machine: Plant) -> Log:
+    """The log of a machine with two actuators, with the mean stroke that the controller gets of both, where only theirs
+    are logged.
+    """
+    if machine.sides == 1 or "x_lvdt" in log.channels or not {*SIDES} <= log.channels.keys():
+        return log
+    a, b = (log.channels[name] for name in SIDES)
+    mean = replace(a, values=0.5 * (a.values + np.interp(a.t, b.t, b.values)))
+    return replace(log, channels={**log.channels, "x_lvdt": mean})
+
+
+def _one_stroke(log: Log, machine: Plant) -> list[str]:
+    """What a log without both strokes of two actuators does not tell."""
+    missing = [name for name in SIDES if name not in log.channels]
+    if machine.sides == 1 or not missing:
+        return []
+    return [
+        f"{', '.join(missing)}: not logged; which actuator or LVDT is at fault cannot be told, and the linkage is "
+        f"judged with both at the mean stroke"
+    ]
+
+
+def subsystems_of(log: Log, machine: Plant) -> dict[str, OfSubsystem]:
+    """The subsystems that a machine has, in order, with their channels in a log."""
+    if machine.sides == 1:
+        return OF_SUBSYSTEM
+    of = OF_SUBSYSTEM | OF_SIDES
+    if {*SIDES} <= log.channels.keys():
+        of["linkage"] = of["linkage"]._replace(needs=SIDES)
+    return {name: of[name] for name in STAGE_ORDER if name != "actuator"}
 
 
 def _hides_no_less(stage: Stage, error: Array | None) -> None:
@@ -211,17 +252,16 @@ def _build(
     machine = plant or build_plant()
     tables = calibration or load_calibration()
     same_stages(geometry=machine.vanes, vane_angles=tables.vanes)
-    if machine.sides > 1:
-        raise LogError(
-            f"{log.path}: actuators.number (={machine.sides}) must be 1 for judging subsystems (docs/machines.md)"
-        )
+    if machine.one_valve:
+        raise LogError(f"{log.path}: actuators.feed (='one valve') must be 'a valve each' for judging subsystems")
     if tables.channels is not None:
         raise LogError(f"{log.path}: channels.number (=2) must be 1 for judging subsystems (docs/channels.md)")
     grid = grid or grid_of(log)
     absent: dict[str, str] = {}
     # subsystems that have the same rows, and the same channels late
     together: dict[tuple[tuple[tuple[int, int], ...], tuple[Late, ...]], list[str]] = {}
-    for name, of in OF_SUBSYSTEM.items():
+    of_machine = subsystems_of(log, machine)
+    for name, of in of_machine.items():
         rows = grid.pieces_of(name, pieces)
         missing = [c for c in of.needs if c not in log.channels]
         gives = [c for c in of.gives if c in machine.vanes or c not in VANES]
@@ -251,18 +291,19 @@ def _build(
         longest,
         stages=[stages[name] for name in STAGE_ORDER if name in stages],
         not_observed={name: absent[name] for name in STAGE_ORDER if name in absent},
-        notes=list(dict.fromkeys(n for c in (longest, *chains) for n in c.notes)) + _cut(log, grid, list(stages)),
+        notes=list(dict.fromkeys(n for c in (longest, *chains) for n in c.notes))
+        + _cut(log, grid, {name: of_machine[name] for name in stages}),
     )
 
 
-def _cut(log: Log, grid: Grid, stages: Sequence[str]) -> list[str]:
+def _cut(log: Log, grid: Grid, stages: Mapping[str, OfSubsystem]) -> list[str]:
     """Notes of the time of the log that subsystems have not, and which of their channels is at fault."""
     many = {name: c for name, c in log.channels.items() if len(c.t) > 1}
     edges = min(c.t[0] for c in many.values()), max(c.t[-1] for c in many.values())
     said: dict[tuple[str, str, int], list[str]] = {}
     notes: dict[str, Note] = {}
-    for name in stages:
-        of, rows = OF_SUBSYSTEM[name], grid.rows_of(name)
+    for name, of in stages.items():
+        rows = grid.rows_of(name)
         drives = [c for c in (*of.needs, *of.takes, "state") if c in many]
         for k, (words, side) in enumerate((("begins at", "before"), ("ends at", "after"))):
             if abs(grid.start + rows[k] * grid.dt - edges[k]) > 1.5 * WINDOW:
@@ -299,7 +340,8 @@ def _chain(
     cal = flashed(tables, machine)
     theirs = tables.program is not None  # a controller of the user's own: its servo's law is not known
     low, high = grid.rows_of(names[0]) if names else (0, grid.rows)
-    explained = {c for name in names for c in OF_SUBSYSTEM[name].gives}
+    of_machine = subsystems_of(log, machine)
+    explained = {c for name in names for c in of_machine[name].gives}
     known = {c: grid.rows_of(c) for c in log.channels}
     part = {c: known[c] for c in known if known[c][0] > low or known[c][1] < high}
     here = log if not part else log[[c for c in known if c not in part or c in explained]]
@@ -325,7 +367,7 @@ def _chain(
     # the stroke between its rows follows from stroke and current, and the current between its own from the servo, too:
     # pressure, oil and speed change slowly, and a line through their gaps takes no motion out of the stroke
     motion = _rows(t, gaps, ("i_cmd", "x_lvdt"), running, mostly)
-    both = _rows(t, gaps, _used("servo"), running, mostly)
+    both = _rows(t, gaps, _used(of_machine["servo"]), running, mostly)
     foreign = [v for v in VANES if v in columns and v not in machine.vanes]
     notes += [f"{v}: this machine has no such vane row (geometry); not judged" for v in foreign]
     if room_for(machine.p) < MOST_CURVES:
@@ -358,7 +400,8 @@ def _chain(
     full = machine.table.actuator.stroke.value
     if {"x_lvdt", "i_cmd"} <= columns.keys():
         rough = Driven(t, have, machine, cal, (), motion.usable, (), turns=partial(reversals, t, have["x_lvdt"], full))
-        smooth = without_noise(t, have, machine, rough.slipping(rough.signals(), machine.p))
+        motor = machine if machine.sides == 1 else machine.alone(0)  # both of two move nearly alike
+        smooth = without_noise(t, have, motor, rough.slipping(rough.signals(), machine.p))
     if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
         if "x_dem" in columns and not theirs and {"servo", "actuator"} & set(names):
             samples = min(10, max(1, round(dt / grid.steps["i_cmd"])))
@@ -370,7 +413,7 @@ def _chain(
                     f"demand"
                 )
                 columns["i_cmd"] = have["i_cmd"]
-                smooth = without_noise(t, have, machine, rough.slipping(rough.signals(), machine.p))
+                smooth = without_noise(t, have, motor, rough.slipping(rough.signals(), machine.p))
                 law, *off = servo_law(t, have, cal, smooth, draws, samples, behind)
             sampled = what == SAMPLED
             have["law"], have["law_error"] = law, off[1] if sampled else off[0]
@@ -380,6 +423,11 @@ def _chain(
                 between_rows(have, law, size, both.run, cal, unknown, seed) for seed in (0, 1)
             )
         have["stroke"] = smooth.stroke
+    smooth_of = {}
+    if machine.sides > 1 and {"i_cmd", *SIDES} <= columns.keys():
+        for side, name in enumerate(SIDES):
+            smooth_of[name] = without_noise(t, {**have, "x_lvdt": columns[name]}, machine.alone(side))
+            have[stroke_of(name)] = smooth_of[name].stroke
     if "linkage" in names and "x_lvdt" in have and resolution(have["x_lvdt"]):
         digit = last_digit(have["x_lvdt"])
         digits = (digit(np.random.default_rng(k)) for k in range(NOISE_DRAWS))
@@ -389,12 +437,12 @@ def _chain(
         have["stroke"] = passed.before(have.get("stroke", have["x_lvdt"]), dt)
     coarse_current = None
     if dt > 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
-        what = _slow_current(Driven(t, have, machine, cal, ("x_lvdt",), motion.currents, present))
+        what = _slow_current(Driven(t, have, motor, cal, ("x_lvdt",), motion.currents, present))
         if what:
             notes.append(f"i_cmd: {what}, not the mean since the row before, which is worked out from it")
             coarse_current = SLOW_CURRENTS[what](columns["i_cmd"][::2])
             columns["i_cmd"] = have["i_cmd"] = SLOW_CURRENTS[what](columns["i_cmd"])
-            smooth = without_noise(t, have, machine, rough.slipping(rough.signals(), machine.p))
+            smooth = without_noise(t, have, motor, rough.slipping(rough.signals(), machine.p))
     turns: Callable[[], dict[str, Array]] = dict
     if "x_lvdt" in columns:
         stroke = have.get("stroke", columns["x_lvdt"])
@@ -408,19 +456,19 @@ def _chain(
     make_of = MAKERS | ({"demand": own_demand_stage} if theirs else {})
     stages, absent = [], {}
     for name in names:
-        needs, _, gives = OF_SUBSYSTEM[name]
+        needs, _, gives = of_machine[name]
         outputs = tuple(c for c in gives if c in columns and (c in machine.vanes or c not in VANES))
         if name in ("servo", "demand") and dt > 1.5 * RASTER:
             absent[name] = f"sample time of {dt:g} s; the controller works every 0.01 s"
             continue
-        own = _rows(t, gaps, _used(name), running, mostly)
-        rows = own.law_holds if name in ("servo", "demand") else own.currents if name == "actuator" else own.machine
+        own = _rows(t, gaps, _used(of_machine[name]), running, mostly)
+        rows = own.law_holds if name in ("servo", "demand") else own.currents if name in ACTUATORS else own.machine
         have |= own.columns()
         # how much of the rotor speed's noise is an error of the demand, only a whole log tells
         told = name == "demand" and bool(pieces)
         driven = Driven(
             t, dict(have), machine, cal, outputs, rows, present, turns=turns, assumed=assumed, passed=passed,
-            again=told,
+            again=told, side=ACTUATORS.get(name),
         )  # fmt: skip
         make = make_of[name]
         stage = make(driven)
@@ -449,14 +497,16 @@ def _chain(
                 change = stage.run(stage.neutral()[None])[0] - varied.run(varied.neutral()[None])[0]
                 more = np.maximum(more, rms(stage, change))
             stage.raster_error = more if stage.raster_error is None else np.hypot(stage.raster_error, more)
-        least = LEAST_FLOOR[name]
+        least = LEAST_FLOOR[name.split("_")[0]]
         if bits and "x_lvdt" in (*needs, *gives):
             stage.coarse = {"x_lvdt": bits}
-        if name == "actuator":
+        if name in ACTUATORS:
             # the error of a stage that integrates moves most: the stroke by itself, or freed of a fitted model's
             # motion, may be quieter
             channel = noise_floor(t, stage.measured[0])
-            freed = noise_floor(t, np.where(np.isfinite(stage.measured[0]), smooth.off, np.nan))
+            freed = noise_floor(
+                t, np.where(np.isfinite(stage.measured[0]), smooth_of.get(outputs[0], smooth).off, np.nan)
+            )
             stage.quiet = np.maximum([min(channel, freed)], least)
         stage.memory = CHAIN_MEMORY
         shown = passed.shown(t)
@@ -501,11 +551,10 @@ class _Rows(NamedTuple):
         }  # fmt: skip
 
 
-def _used(name: str) -> tuple[str, ...]:
+def _used(of: OfSubsystem) -> tuple[str, ...]:
     """Channels whose gaps count in a subsystem: what drives it, what it explains but for the vanes, of which each has
     gaps of its own.
     """
-    of = OF_SUBSYSTEM[name]
     return (*of.needs, *of.takes, *(c for c in of.gives if c not in VANES))
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from plant.model import side_of
 from plant.parameters import derive
+from plant.places import X
 from plant.stages import linkage_run
 from plant.stages.linkage import speed_reach
 from vaneloop.identification.onset import that_begins
 from vaneloop.identification.settings import SETTLE, WINDOW
 from vaneloop.identification.subsystem import Array, Named, Stage
-from vaneloop.identification.vane_chain.parameters import declared, lanes, like_temperature, like_time
+from vaneloop.identification.vane_chain.parameters import declared_by_side, lanes_by_side, like_temperature, like_time
 from vaneloop.identification.vane_chain.resample import expect_draws, pieces_of, since
 from vaneloop.identification.vane_chain.subsystem_data import STROKE_OFF, VANES_LATE, Driven, Made, excerpts
 
@@ -19,12 +21,14 @@ __all__ = ["linkage_stage"]
 
 @that_begins
 def linkage_stage(driven: Driven) -> Stage:
-    """Vane angles that the log has, from the stroke."""
+    """Vane angles that the log has, from the stroke, or from those of two actuators."""
     t, c, machine, _, outputs, run = driven[:6]
-    parameters, effects, rows, si = declared("linkage", driven)
+    of = declared_by_side("linkage", driven)
+    parameters, effects = of.parameters, of.effects
     signals = driven.signals()
     dt = float(t[1] - t[0])
-    x = np.ascontiguousarray(c.get("stroke", c["x_lvdt"]) * 1e-3)
+    strokes = driven.both or (c.get("stroke", c["x_lvdt"]),) * machine.sides  # of two that nobody logged, their mean
+    x, *x_b = (np.ascontiguousarray(one * 1e-3) for one in strokes)
     n_r = np.ascontiguousarray(c.get("n_r", np.zeros(len(t))))
     t_oil = np.ascontiguousarray(c["t_oil"])
     late = c.get(VANES_LATE)
@@ -32,14 +36,17 @@ def linkage_stage(driven: Driven) -> Stage:
     begun = [o in c and bool(driven.sampled(o)[: round(WINDOW / dt)].any()) for o in machine.vanes]
     first = [np.deg2rad(np.median(c[o][:5])) if b else np.nan for o, b in zip(machine.vanes, begun, strict=True)]
 
-    def simulate(thetas: Array, t: Array = t, t_oil: Array = t_oil, x: Array = x) -> Array:
-        p = lanes(driven, thetas, rows, si)
+    def simulate(thetas: Array, t: Array = t, t_oil: Array = t_oil, off: Array | None = None) -> Array:
+        p, *p_b = lanes_by_side(driven, thetas, of)
         derive(p, dt, dt)
-        start = machine.start(stroke=x[0], n_r=n_r[0])
+        own, *other = (x, *x_b) if off is None else (one + off for one in (x, *x_b))
+        start = machine.start(stroke=own[0], n_r=n_r[0])
+        for side, one in enumerate(other, 1):
+            start[X, side] = one[0]
         machine.place_rings(start, tuple(first))
-        s = np.repeat(start, len(thetas), axis=1)
+        s = np.repeat(start[:, :1], len(thetas), axis=1)
         out = np.empty((len(thetas), len(first), len(t)))
-        linkage_run(x, n_r, t_oil, t, dt, p, s, out.transpose(2, 1, 0), driven.slipping(signals, p))
+        linkage_run(own, n_r, t_oil, t, dt, p, s, out.transpose(2, 1, 0), driven.slipping(signals, p), *other, *p_b)
         out = out if which == list(range(len(first))) else out[:, which]
         out = driven.passed.of_rows(np.rad2deg(out, out=out), dt)
         return out if late is None else _earlier(out, late / dt)
@@ -61,8 +68,9 @@ def linkage_stage(driven: Driven) -> Stage:
     stage.twins = {
         "linkage_wear": ("oil temperature", lambda thetas: simulate(thetas, t=warming)),
         **{
-            name: ("time", lambda thetas: simulate(thetas, t_oil=ageing))
-            for name in ("thermal_growth", "lvdt_thermal_drift")
+            e.name: ("time", lambda thetas: simulate(thetas, t_oil=ageing))
+            for e in effects
+            if side_of(e.name)[1] in ("thermal_growth", "lvdt_thermal_drift")
         },
     }
 
@@ -78,7 +86,7 @@ def linkage_stage(driven: Driven) -> Stage:
     if STROKE_OFF in c and not driven.again:
         neutral = stage.neutral()[None]
         as_logged = simulate(neutral)[0]
-        expect_draws(stage, np.array([simulate(neutral, x=x + 1e-3 * off)[0] - as_logged for off in c[STROKE_OFF].T]))
+        expect_draws(stage, np.array([simulate(neutral, off=1e-3 * off)[0] - as_logged for off in c[STROKE_OFF].T]))
     stage.counted = kept
     stage.excerpt, stage.made = excerpts(linkage_stage, driven, stage, kept), Made(linkage_stage, driven)
     return stage

@@ -5,15 +5,17 @@ plant's parameters behind them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from plant import chain
 from plant.curve import PLACES, Place, at_curve, quantity_of
+from plant.effect import Effect as PlantEffect
 from plant.effects import EFFECTS
 from plant.geometry import STANDS_FOR
-from plant.model import allowed_of
+from plant.model import SIDE_NAMES, allowed_of, of_a_side, side_of
 from plant.stages import run_bends
 from vaneloop.base.vanes import VANES, vane_in
 from vaneloop.identification.settings import EFFECT_FACTORS, EFFECT_SIZES, SHAPE_KNOWN, SHAPE_STARTS
@@ -21,8 +23,12 @@ from vaneloop.identification.subsystem import Array, Effect, Parameter
 from vaneloop.identification.user_models.terms import Curve
 from vaneloop.identification.vane_chain.subsystem_data import Driven
 
-__all__ = ["ALL_PLACES", "FREE", "SHAPES", "bends", "declared", "lanes", "like_temperature", "like_time"]
+__all__ = [
+    "ALL_PLACES", "BOTH", "FREE", "SHAPES", "Declared", "bends", "declared", "declared_by_side", "lanes",
+    "lanes_by_side", "like_temperature", "like_time",
+]  # fmt: skip
 
+BOTH = -1  # of two actuators, where a number is of each: not 0 A, nor 1 B
 ALL_PLACES = tuple(PLACES.values())  # a curve's place is a number of these
 
 FREE = {  # nominal parameters that a stage refits within their tolerance, those of them that the machine has
@@ -38,6 +44,7 @@ FREE = {  # nominal parameters that a stage refits within their tolerance, those
         "drive.speed_time",
         "screw.friction",  # of an electromechanical one
         "sensors.lvdt_lag",
+        "actuators.ring_stiffness",  # of two
     ),
     "linkage": (
         *(f"linkage.{s}_play" for s in VANES),
@@ -48,34 +55,59 @@ FREE = {  # nominal parameters that a stage refits within their tolerance, those
 SHAPES = (*SHAPE_STARTS, "phase", "roundness")
 
 
+class Declared(NamedTuple):
+    """Parameters and effects of a stage as the search takes them.
+
+    rows, si  rows of the plant's parameters behind its columns, and their factors to SI; its curves, which are the last
+              effects, have none
+    sides     of two actuators, whose number each is: 0 A, 1 B, -1 both
+    """
+
+    parameters: tuple[Parameter, ...]
+    effects: tuple[Effect, ...]
+    rows: Array
+    si: Array
+    sides: Array
+
+
 def declared(stage: str, driven: Driven) -> tuple[tuple[Parameter, ...], tuple[Effect, ...], Array, Array]:
-    """Parameters and effects of a stage, the rows of the plant's parameter array behind its columns, and their factors
-    to SI. Its curves are the last effects; they have no rows.
+    """`declared_by_side` of a stage that two actuators have in common."""
+    return declared_by_side(stage, driven)[:4]
+
+
+def declared_by_side(stage: str, driven: Driven) -> Declared:
+    """Parameters and effects of a stage.
+
+    Of two actuators those of valve, actuator and LVDT are a side's, named as in a model file: ``side_a.lvdt_bias``. The
+    actuator of a side has its own, and the LVDT of the other, whose reading drives it through the rings. Where both
+    strokes drive a stage it has either LVDT's, and what both have alike.
     """
     machine = driven.machine
     known = {n.name: n for n in machine.nominal}
-    parameters, rows, si = [], [], []
+    parameters, rows, si, sides = [], [], [], []
     for name in FREE[stage]:
         if name not in known:
             continue
         n = known[name]
+        side = driven.side if driven.side is not None and of_a_side(name, machine.one_valve) else BOTH
         ring = 1.0
         if name.endswith("_play"):  # known at the vane, used at the ring; a model's lever does not change what it says
             vane = VANES.index(str(vane_in(name)))
             lever = known[f"linkage.{VANES[vane]}_l"]
             ring = lever.value * lever.si / machine.lever(vane)[0]
-        value = float(machine.p[n.row, 0]) / (n.si * ring)
-        value = n.value if math.isclose(value, n.value, rel_tol=1e-12) else value  # through SI and back
+        value = float(machine.p[n.row, max(side, 0)]) / (n.si * ring)
+        middle = machine.nominal_of(n, max(side, 0))
+        value = middle if math.isclose(value, middle, rel_tol=1e-12) else value  # through SI and back
+        at = "" if side == BOTH else f"{SIDE_NAMES[side]}."
         parameters.append(
-            Parameter(name, value, n.unit, *allowed_of(machine, n), n.tolerance, vane_in(name), middle=n.value)
+            Parameter(f"{at}{name}", value, n.unit, *allowed_of(machine, n), n.tolerance, vane_in(name), middle=middle)
         )
         si.append(n.si * ring)
         rows.append(n.row)
+        sides.append(side)
     effects = []
     for e in EFFECTS.values():
-        if stage not in e.stages or e.name in driven.present or machine.kind not in e.kinds:
-            continue
-        if driven.laws is not None and e.name not in driven.laws:
+        if stage not in e.stages or machine.kind not in e.kinds:
             continue
         own = machine.parameters_of(e.name)
         ps = tuple(
@@ -92,11 +124,36 @@ def declared(stage: str, driven: Driven) -> tuple[tuple[Parameter, ...], tuple[E
             )
             for p in own.values()
         )
-        effects.append(Effect(e.name, ps, _starts(e.name, ps), e.excites))
-        rows += list(own)
-        si += [p.si for p in own.values()]
+        for side in sides_of(e, driven):
+            name = e.name if side == BOTH else f"{SIDE_NAMES[side]}.{e.name}"
+            if driven.present and _has(driven.present, name):
+                continue
+            if driven.laws is not None and name not in driven.laws:
+                continue
+            family = e.name if machine.sides > 1 and of_a_side(e.name, machine.one_valve) else ""
+            effects.append(Effect(name, ps, _starts(e.name, ps), e.excites, family=family))
+            rows += list(own)
+            si += [p.si for p in own.values()]
+            sides += [side] * len(own)
     effects += [e for _, e in driven.curves]
-    return tuple(parameters), tuple(effects), np.array(rows, dtype=int), np.array(si)
+    columns = (np.array(x, dtype=kind) for x, kind in ((rows, int), (si, float), (sides, int)))
+    return Declared(tuple(parameters), tuple(effects), *columns)
+
+
+def sides_of(e: PlantEffect, driven: Driven) -> tuple[int, ...]:
+    """Whose an effect can be in a stage: `BOTH`, 0 A, 1 B."""
+    machine = driven.machine
+    if machine.sides == 1 or not of_a_side(e.name, machine.one_valve):
+        return (BOTH,)
+    if driven.side is None:
+        return (BOTH, 0, 1) if driven.both is not None else (BOTH,)
+    return (driven.side, 1 - driven.side) if e.site == "lvdt" and driven.both is not None else (driven.side,)
+
+
+def _has(present: Sequence[str], name: str) -> bool:
+    """Whether a model that has the effects ``present`` has that of this name: of both, it has either side's, too."""
+    side, effect = side_of(name)
+    return any(effect == its and (not side or not at or at == side) for at, its in map(side_of, present))
 
 
 def _starts(name: str, ps: tuple[Parameter, ...]) -> tuple[tuple[float, ...], ...]:
@@ -139,14 +196,38 @@ def _starts(name: str, ps: tuple[Parameter, ...]) -> tuple[tuple[float, ...], ..
 
 
 def lanes(driven: Driven, thetas: Array, rows: Array, si: Array) -> Array:
-    """The plant's parameter array with one lane per parameter set."""
-    p = np.repeat(driven.machine.p, len(thetas), axis=1)
+    """The plant's parameter array with one lane per parameter set; of two actuators, A's."""
+    p = np.repeat(driven.machine.p[:, :1], len(thetas), axis=1)
     p[rows] = (thetas[:, : len(rows)] * si).T
     for place, curve, tables in tables_of(driven, thetas):
         q = quantity_of(curve.quantity)
         assert q is not None
         at_curve(p, place, q, curve.low, curve.high, tables)
     return p
+
+
+def lanes_by_side(driven: Driven, thetas: Array, of: Declared) -> list[Array]:
+    """`lanes` of each actuator that the machine has."""
+    if driven.machine.sides == 1:
+        return [lanes(driven, thetas, of.rows, of.si)]
+    out = []
+    for side in range(driven.machine.sides):
+        p = np.repeat(driven.machine.p[:, side : side + 1], len(thetas), axis=1)
+        # what is of both stands before what a side has in its place: a set has one of them
+        values, neutral = thetas[:, : len(of.rows)] * of.si, _neutral(of) * of.si
+        for column in np.flatnonzero((of.sides == BOTH) | (of.sides == side)):
+            if of.sides[column] == BOTH or column < len(of.parameters):
+                p[of.rows[column]] = values[:, column]
+            else:
+                has = values[:, column] != neutral[column]
+                p[of.rows[column], has] = values[has, column]
+        out.append(p)
+    return out
+
+
+def _neutral(of: Declared) -> Array:
+    """The value of each column where nothing is recalibrated and no effect is there."""
+    return np.array([p.value for p in (*of.parameters, *(p for e in of.effects for p in e.parameters))][: len(of.rows)])
 
 
 def tables_of(driven: Driven, thetas: Array) -> list[tuple[Place, Curve, Array]]:

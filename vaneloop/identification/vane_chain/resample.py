@@ -24,6 +24,7 @@ from vaneloop.identification.subsystem import Array, Stage
 
 __all__ = [
     "DEMANDS",
+    "OF_SIDES",
     "OF_SUBSYSTEM",
     "Gaps",
     "Grid",
@@ -64,6 +65,10 @@ OF_SUBSYSTEM = {
     "engine": OfSubsystem(("n_dem",), (), ("n_r",)),
     "actuator": OfSubsystem(("i_cmd",), ("n_r", "p_s", "t_oil"), ("x_lvdt",)),
     "linkage": OfSubsystem(("x_lvdt",), ("n_r", "t_oil"), VANES),
+}
+OF_SIDES = {  # of two actuators, in place of the one; the rings bring the other's stroke to each
+    "actuator_a": OfSubsystem(("i_cmd", "x_lvdt_b"), ("n_r", "p_s", "t_oil"), ("x_lvdt_a",)),
+    "actuator_b": OfSubsystem(("i_cmd", "x_lvdt_a"), ("n_r", "p_s", "t_oil"), ("x_lvdt_b",)),
 }
 
 
@@ -113,7 +118,7 @@ def grid_of(log: Log) -> Grid:
         raise LogError(f"{log.path}: no channel has more than {FEW} samples")
     dt = max(RASTER, round(float(np.median([steps[name] for name in many])) / RASTER) * RASTER)
     spans = {}
-    for name, of in OF_SUBSYSTEM.items():
+    for name, of in (OF_SUBSYSTEM | OF_SIDES).items():
         gives = [many[c] for c in of.gives if c in many]
         if gives and all(c in channels for c in of.needs):
             own = [many[c] for c in (*of.needs, *of.takes, "state") if c in many]

@@ -42,7 +42,10 @@ from vaneloop.identification.vane_chain.subsystem_data import Made
 __all__ = ["bounded", "expect_stationary_noise", "like"]
 
 # each subsystem after those that explain what drives it: the channel whose noise it may pass on
-ORDER: Mapping[str, str] = {"engine": "", "servo": "x_lvdt", "actuator": "i_cmd", "demand": "n_r", "linkage": "x_lvdt"}
+ORDER: Mapping[str, str] = {
+    "engine": "", "servo": "x_lvdt", "actuator": "i_cmd", "actuator_a": "i_cmd", "actuator_b": "i_cmd", "demand": "n_r",
+    "linkage": "x_lvdt",
+}  # fmt: skip
 ALSO = {"x_lvdt": ("stroke",), "i_cmd": ("ticks", "other_ticks")}  # columns that hold the same
 
 

@@ -13,9 +13,11 @@ from plant import Plant
 from plant.curve import KNOWN, QUANTITIES, quantity_of
 from plant.effects import CURVES
 from plant.layout import C_HIGH, C_LAG, C_OF, C_STOPS, C_TABLE, CURVE_ROWS
+from plant.model import SIDE_NAMES
 from plant.stages.blocks import NOTHING
 from vaneloop.base.durations import named_lag
 from vaneloop.base.hysteresis import RADII, slipped, stops_of
+from vaneloop.base.signals import SIDES
 from vaneloop.base.vanes import VANES
 from vaneloop.identification.subsystem import Array, Effect, Stage
 from vaneloop.identification.user_models.exogenous_regressors import lagged
@@ -23,11 +25,16 @@ from vaneloop.identification.user_models.motion import smoothed
 from vaneloop.identification.user_models.simulation import Placed
 from vaneloop.identification.vane_chain.low_pass import AS_LOGGED, LowPass
 
-__all__ = ["SAMPLED_OF", "STROKE_OFF", "VANES_LATE", "Driven", "Made", "excerpts"]
+__all__ = ["SAMPLED_OF", "STROKE_OFF", "VANES_LATE", "Driven", "Made", "excerpts", "stroke_of"]
 
 SAMPLED_OF = "sampled "  # and an output's name: a column that is 1 where the output was sampled; without it, everywhere
 STROKE_OFF = "stroke off"  # a column, float64[rows, draws]: mm, what the last digit of the stroke may be off by
 VANES_LATE = "vanes late"  # a column: s, by which each row of the vane angles stands late; without it, 0
+
+
+def stroke_of(name: str) -> str:
+    """The column of a measured stroke with less of the LVDT's noise: ``stroke`` of ``x_lvdt``, and of a side's."""
+    return name.replace("x_lvdt", "stroke")
 
 
 class Driven(NamedTuple):
@@ -46,6 +53,7 @@ class Driven(NamedTuple):
     part_of              of an excerpt: the whole, and which of its rows these are
     again                whether the stage takes its noise over, as one does that was made of this log before: it is not
                          estimated
+    side                 of two actuators, the one that the stage is about (0 A, 1 B); None: both, or the only one
     """
 
     t: Array
@@ -62,6 +70,15 @@ class Driven(NamedTuple):
     passed: LowPass = AS_LOGGED
     part_of: tuple[Driven, Array | slice] | None = None
     again: bool = False
+    side: int | None = None
+
+    def name(self, stage: str) -> str:
+        """What a stage is called: that of one of two actuators with its side, ``actuator_b``."""
+        return stage if self.side is None else f"{stage}_{SIDE_NAMES[self.side][-1]}"
+
+    def own(self, effect: str) -> str:
+        """What an effect is called where it is that of the stage's side."""
+        return effect if self.side is None else f"{SIDE_NAMES[self.side]}.{effect}"
 
     def at(self, rows: Array | slice, columns: dict[str, Array], run: Array) -> Driven:
         """Some of the rows, with their ``columns``, and which of them count."""
@@ -75,6 +92,16 @@ class Driven(NamedTuple):
         """At which rows an output was sampled, bool[samples]."""
         there = self.columns.get(SAMPLED_OF + name)
         return np.ones(len(self.t), dtype=bool) if there is None else there > 0.0
+
+    @property
+    def both(self) -> tuple[Array, Array] | None:
+        """The strokes (mm) of two actuators, A's and B's, with less of the LVDTs' noise; None: there is one, or the log
+        has not both.
+        """
+        if self.machine.sides == 1 or not {*SIDES} <= self.columns.keys():
+            return None
+        a, b = (self.columns.get(stroke_of(name), self.columns[name]) for name in SIDES)
+        return a, b
 
     @property
     def curved(self) -> bool:
