@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,6 +26,8 @@ from plant.stages import ring_loads
 from vaneloop import Machine
 from vaneloop.base.errors import InputError
 from vaneloop.cli.main import main
+from vaneloop.identification import workflow
+from vaneloop.identification.results import Found
 from vaneloop.identification.subsystem import Stage
 from vaneloop.identification.vane_chain.candidates import without_laws
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
@@ -226,6 +230,42 @@ def test_what_is_not_looked_for_is_not_looked_for_at_either_side() -> None:
         names = {e.name for e in stage.effects}
         assert not {"lvdt_bias", "side_a.lvdt_bias", "side_b.lvdt_bias", "side_a.piston_friction"} & names
         assert ("side_b.piston_friction" in names) == (stage.name == "actuator_b")
+
+
+def answer(stage: str, name: str, low: float, high: float, nats: float, rivals: Sequence[str] = ()) -> SimpleNamespace:
+    """What a stage says: an effect with its interval, and rivals of the size -1."""
+    size = {"size": {"value": 0.5 * (low + high), "low": low, "high": high}}
+    fits = {name: size, **{m: {"size": {"value": -1.0, "low": -1.1, "high": -0.9}} for m in rivals}}
+    shares = dict.fromkeys((name, *rivals), 0.9 / (1 + len(rivals)))
+    one = Found(name, shares[name], size, list(rivals), nats, fits=fits, probabilities=shares)
+    return SimpleNamespace(stage=stage, effects=[one])
+
+
+@pytest.mark.parametrize(
+    ("said", "names"),
+    [
+        ([("a", "side_a.x", 1.0, 2.0, 9.0), ("b", "side_b.x", 1.5, 3.0, 8.0)], ["x", "x"]),
+        ([("a", "side_a.x", 1.0, 2.0, 9.0), ("b", "side_b.x", 2.5, 3.0, 8.0)], ["side_a.x", "side_b.x"]),
+        ([("a", "side_a.x", 1.0, 2.0, 9.0)], ["side_a.x"]),
+        ([("a", "side_a.x", 1.0, 2.0, 9.0), ("b", "side_a.x", 1.0, 2.0, 8.0)], ["side_a.x", "side_a.x"]),
+        (
+            [("a", "side_a.x", 1.0, 2.0, 7.0, ["side_b.x"]), ("b", "side_b.x", -1.1, -0.9, 8.0, ["side_a.x"])],
+            ["side_b.x", "side_b.x"],
+        ),
+    ],
+)
+def test_a_family_has_one_name_where_sizes_agree_or_nothing_tells(
+    said: list[tuple[str, ...]], names: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workflow, "parameters_of", lambda stage, fit, name: fit)
+    results = [answer(*one) for one in said]  # type: ignore[arg-type]
+    stages = {d.stage: SimpleNamespace(effect=lambda name: SimpleNamespace(family="x")) for d in results}
+    workflow._join(stages, results)  # type: ignore[arg-type]
+    found = [d.effects[0] for d in results]
+    assert [f.effect for f in found] == names and all(f.effect in f.probabilities for f in found)
+    assert all(f.effect not in f.rivals for f in found)
+    if names == ["side_b.x", "side_b.x"]:
+        assert found[0].rivals == ["side_a.x"] and found[0].parameters["size"]["value"] == -1.0
 
 
 # ---- model files -----------------------------------------------------------------------------------------------------

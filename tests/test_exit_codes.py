@@ -142,6 +142,10 @@ def test_what_a_number_must_be_is_said_with_the_number() -> None:
         (["hidden_effect", "--workers", "65"], "--workers (=65) must be in [1, 64]"),
         (["hidden_effect", "--duration", "5"], "--duration (=5 s) must be in [30, 1e5]"),
         (["hidden_effect", "--seed", "-1"], "--seed (=-1) must be in [0, 2^63)"),
+        (["two_actuators", "--logs", "0"], "--logs (=0) must be in [1, 100000]"),
+        (["two_actuators", "--workers", "65"], "--workers (=65) must be in [1, 64]"),
+        (["two_actuators", "--duration", "5"], "--duration (=5 s) must be in [30, 3600]"),
+        (["two_actuators", "--seed", "-1"], "--seed (=-1) must be in [0, 2^63)"),
     ],
 )
 def test_a_number_out_of_range_is_named(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -368,8 +368,8 @@ def _in_place_of(stage: Stage, other: StageDiagnosis, effect: str) -> tuple[str,
 
 
 def _join(stages: dict[str, Stage], results: Sequence[StageDiagnosis]) -> None:
-    """Give one name to what each place of the machine has alike: to the effects of a family that stages name, each its
-    own, where their sizes agree.
+    """Give one name to what stages say of a family: where members are each other's rivals, that of the stage where it
+    gains most; where each stage names its own and their sizes agree, the family's, for each place has it.
     """
     families: dict[str, list[tuple[StageDiagnosis, int]]] = {}
     for d in results:
@@ -377,6 +377,15 @@ def _join(stages: dict[str, Stage], results: Sequence[StageDiagnosis]) -> None:
             if family := stages[d.stage].effect(f.effect).family:
                 families.setdefault(family, []).append((d, k))
     for family, members in families.items():
+        lead = max((d.effects[k] for d, k in members), key=lambda f: f.nats).effect
+        for d, k in members:
+            f = d.effects[k]
+            if lead in f.rivals and lead in f.fits:
+                d.effects[k] = replace(
+                    f, effect=lead, rivals=[f.effect if m == lead else m for m in f.rivals],
+                    parameters=parameters_of(stages[d.stage], f.fits[lead], lead),
+                    probability=f.probabilities.get(lead, f.probability),
+                )  # fmt: skip
         found = [d.effects[k] for d, k in members]
         if len({f.effect for f in found}) < max(2, len(found)) or not _alike([f.parameters for f in found]):
             continue
