@@ -1198,7 +1198,7 @@ def extending(monkeypatch: pytest.MonkeyPatch) -> Any:
         not_observed: Any
         notes: Any = ("n",)
         whole: Any = None
-        plant: Any = field(default_factory=lambda: SimpleNamespace(kind="hydraulic"))
+        plant: Any = field(default_factory=lambda: SimpleNamespace(kind="hydraulic", sides=1))
         start: float = 10.0
 
         def stage(self, name: str) -> Any:

@@ -730,6 +730,8 @@ def _forms(name: str, chain: Chain) -> tuple[str, ...]:
     """The names by which the stages have an effect that was asked for: its own; of two actuators that have one each,
     that of either side.
     """
+    if chain.plant.sides == 1:
+        return (name,)
     have = {e.name for s in chain.stages for e in s.effects}
     of_sides = tuple(f"{side}.{name}" for side in SIDE_NAMES if f"{side}.{name}" in have)
     return (name,) if name in have else of_sides or (name,)

@@ -7,8 +7,8 @@ What tells it from missing physics: it is the same under every condition. An err
 * no bin has a mean that makes as much of it, or such a slope in the windows whose constant is free,
 * no line of its spectrum does: what swings has a cause,
 * the nominal parameters, beyond their tolerances, would take no more of it than chance allows,
-* but for the one bin in twenty that chance allows; and the bins are known well enough to tell. Where they are not, two
-  neighbours count as one; of several outputs, which have one recorder, one must tell.
+* but for the one bin in twenty that chance allows; and the bins are known well enough to tell: those of one output,
+  where a subsystem has several, for these have one recorder.
 
 Expected is the output's own noise, which is no more than how the output moves where it is quietest, and a share of what
 draws of noise do in a channel that drives the subsystem, which through a table or through play is not alike everywhere.
@@ -145,46 +145,38 @@ def _noise_in(judge: LeastSquaresProblem, k: int, error: Array, made: Array, out
     if not bins:
         return None
     place = ((stage.t - stage.t[0]) / stage.window) % 1.0 - 0.5 if stage.window else np.ones_like(stage.t)
-    sums = [[b.sums(x) for b in bins] for x in (np.ones_like(error), error**2, made, error * place)]
-    count = sum(x.sum() for x in sums[0])
-    whole = float(sum(x.sum() for x in sums[1]) / count)
+    n, square, through, sign = (
+        np.concatenate([b.sums(x) for b in bins]) for x in (np.ones_like(error), error**2, made, error * place)
+    )
+    count = n.sum(axis=1)
+    whole = float(square.sum() / count.sum())
     if whole <= ((1.0 + FLOOR_KNOWN) * floor) ** 2:
         return Expected(floor, 0.0)
     counted = np.where(judge.valid[k], error, np.nan)
-    excess = 1.0 - floor**2 / whole
-    spectrum = np.abs(np.fft.rfft(np.nan_to_num(counted - np.nanmean(counted)))) ** 2
-    if float(np.convolve(spectrum, np.ones(3), "same").max() / spectrum.sum()) >= NOISE_ALIKE * excess:
-        return None
     own_most = QUIET_KNOWN_TO**2 * _power(
         _quietest(_windows(stage, np.where(judge.valid[k], output, np.nan), stage.window))
     )
+    weight = 1.0 / (np.sqrt(count) * whole)
+    a = np.array([whole * count, through.sum(axis=1)]).T
     most = np.array([own_most / whole, QUIET_KNOWN_TO**2])
+    own, share = bounded(a * weight[:, None], square.sum(axis=1) * weight, most) * (whole, 1.0)
+    excess = 1.0 - floor**2 / whole
+    expected = own * n + share * through
+    of = np.maximum(expected, whole * n)  # where little is expected, what is left counts as it does elsewhere
+    ratio, deviation = _over_blocks(square - expected + of, of)
+    mean, of_mean = _over_blocks(sign, n)
     of_sign = NOISE_ALIKE * excess * whole * float(np.mean(place[judge.valid[k]] ** 2))
-    while True:
-        n, square, through, sign = (np.concatenate(x) for x in sums)
-        count = n.sum(axis=1)
-        weight = 1.0 / (np.sqrt(count) * whole)
-        a = np.array([whole * count, through.sum(axis=1)]).T
-        own, share = bounded(a * weight[:, None], square.sum(axis=1) * weight, most) * (whole, 1.0)
-        expected = own * n + share * through
-        of = np.maximum(expected, whole * n)  # where little is expected, what is left counts as it does elsewhere
-        ratio, deviation = _over_blocks(square - expected + of, of)
-        mean, of_mean = _over_blocks(sign, n)
-        differs = np.abs(ratio - 1.0) > NOISE_ALIKE * excess + 2.0 * deviation
-        signed = np.maximum(np.abs(mean) - 2.0 * of_mean, 0.0) ** 2 > of_sign
-        short = 1.0 - float(expected.sum() / square.sum())  # where own noise and that of the channel are not enough
-        if short > 0.5 * NOISE_ALIKE * excess or max(np.mean(differs), np.mean(signed)) > NOISE_BY_CHANCE:
-            return None
-        told = float(np.median(deviation)) <= 0.5 * NOISE_ALIKE * excess
-        coarser = [[_in_pairs(x) for x in of_bins] for of_bins in sums]
-        if told or all(len(x) == len(y) for x, y in zip(coarser[0], sums[0], strict=True)):
-            return Expected(float(np.sqrt(whole)), float(share), told)
-        sums = coarser
-
-
-def _in_pairs(values: Array) -> Array:
-    """Sums of each two neighbouring bins, float64[bins / 2, blocks]; as they are where that leaves less than two."""
-    return values if len(values) % 2 or len(values) < 4 else values[::2] + values[1::2]
+    differs = np.abs(ratio - 1.0) > NOISE_ALIKE * excess + 2.0 * deviation
+    signed = np.maximum(np.abs(mean) - 2.0 * of_mean, 0.0) ** 2 > of_sign
+    spectrum = np.abs(np.fft.rfft(np.nan_to_num(counted - np.nanmean(counted)))) ** 2
+    line = float(np.convolve(spectrum, np.ones(3), "same").max() / spectrum.sum())
+    short = 1.0 - float(expected.sum() / square.sum())  # where own noise and that of the channel are not enough
+    if line >= NOISE_ALIKE * excess or short > 0.5 * NOISE_ALIKE * excess:
+        return None
+    if max(np.mean(differs), np.mean(signed)) > NOISE_BY_CHANCE:
+        return None
+    told = float(np.median(deviation)) <= 0.5 * NOISE_ALIKE * excess
+    return Expected(float(np.sqrt(whole)), float(share), told)
 
 
 def _of_parameters(judge: LeastSquaresProblem, theta: Array) -> Array:
