@@ -117,3 +117,12 @@ def test_what_a_state_loses_is_named_by_its_physics(
     logs = [logged(true, output, unit, inputs, p, seed) for seed in (11, 12)]
     answer = diagnose(logs[:1], system, test=logs[1:])
     assert [e["effect"] for e in answer.to_dict()["effects"]] == [name]
+
+
+def test_what_drives_a_model_may_count_squared_and_no_sensor_reads_a_square() -> None:
+    system = System(
+        name="s", kind="static", model=lambda u, p: p.a * u.volts, inputs={"volts": "V"}, outputs={"heat": "W"},
+        parameters=[unknown("a", 1.0, "W/V")],
+    )  # fmt: skip
+    bound = BoundSystem(system, [Record("log", T, {"volts": 2.0 + np.sin(T), "heat": 3.0 + np.sin(T)})])
+    assert [e.name for e in bound.effects if e.name.endswith(".square")] == ["volts.square"]

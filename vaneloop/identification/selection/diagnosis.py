@@ -279,7 +279,7 @@ class EffectSelection:
         if current.effects:
             return search.best_of([(*current.effects, m) for m in names])
         options = [f for m, f in self.singles.items() if m in names]
-        leaders = [m for m in self.ranked if m in names][: criterion.leaders]
+        leaders = self._leaders([m for m in self.ranked if m in names])
         alone = [f for f in options if criterion.accepts(current, f)]
         # of a model that roams, pairs are tried where no effect helps alone; else where the best one leaves more
         # than noise, and no other makes up for that beside it
@@ -288,11 +288,30 @@ class EffectSelection:
             (first,) = min(alone, key=criterion.order).effects
             tried += search.best_of([(first, m) for m in names if m != first])
         if criterion.roams and not alone and leaders:
-            # the leader may need one that does nothing alone, and those that do the same elsewhere are leaders, too
-            options += search.best_of([(leaders[0], m) for m in names if m != leaders[0]])
+            # a leader may need one that does nothing alone
+            for first in leaders[:PAIR_LEADERS]:
+                options += search.best_of([(first, m) for m in names if m != first])
         if tried and not (criterion.roams and alone) and _least(search, tried) > TOLERATED:
             options += search.best_of(list(itertools.combinations(leaders, 2)))
         return options
+
+    def _leaders(self, ranked: list[str]) -> list[str]:
+        """The leading effects; of a model that roams no two that do the same, such as a gain at either end: they count
+        as one.
+        """
+        search, criterion, out = self.search, self.search.criterion, list[str]()
+        if not criterion.roams:
+            return ranked[: criterion.leaders]
+        errors: list[Array] = []
+        for name in ranked:
+            error = search.judge.errors(self.singles[name].theta[None])[0]
+            apart = [float(np.sqrt(np.sum((error - other) ** 2) / max(search.judge.n, 1))) for other in errors]
+            if all(rms > criterion.form for rms in apart):
+                out.append(name)
+                errors.append(error)
+            if len(out) == criterion.leaders:
+                break
+        return out
 
     def accepted(self, current: Fit, tried: Sequence[Fit]) -> list[Fit]:
         """Those that the criterion accepts; of none, the way by another leading effect."""

@@ -85,7 +85,7 @@ def significant(judge: LeastSquaresProblem, before: Fit, after: Fit, correlation
 class LikelihoodAcceptance:
     """The criterion (`identification.selection.search.Criterion`); ``known``: relative error of the noise floor."""
 
-    most, leaders, fitted, finished, least, roams = 4, 5, 1_000_000, 3, NATS, False
+    most, leaders, fitted, finished, least, form, roams = 4, 5, 1_000_000, 3, NATS, 0.0, False
 
     def __init__(self, judge: LeastSquaresProblem, known: float = FLOOR_KNOWN):
         self.judge, self.known = judge, known

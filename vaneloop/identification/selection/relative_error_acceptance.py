@@ -122,19 +122,26 @@ class RelativeErrorAcceptance:
 
     def _swapped(self, search: Search, fit: Fit, names: list[str]) -> Fit:
         """Exchange one effect for another where that is better: what was right first need not be right last. One with
-        more parameters must be worth them.
+        more parameters must be worth them, and one that others make needless brings nothing.
         """
         for _ in range(2):
             best = fit
             for drop in fit.effects:
                 rest = tuple(e for e in fit.effects if e != drop)
                 options = search.best_of([(*rest, n) for n in names if n not in fit.effects])
-                better = [f for f in options if self.order(f) < self.order(best) - BETTER]
+                better = [
+                    f for f in options if self.order(f) < self.order(best) - BETTER and not self._leaves_more(best, f)
+                ]
                 best = next((f for f in better if len(f.free) <= len(best.free) or self.accepts(best, f)), best)
-            if best is fit:
+            needed = search.pruned(best)
+            if self.order(needed) >= self.order(fit) or self._leaves_more(fit, needed):
                 return fit
-            fit = search.pruned(best)
+            fit = needed
         return fit
+
+    def _leaves_more(self, before: Fit, after: Fit) -> bool:
+        """Whether a set leaves clearly more of the whole log, however well it does in blocks where little moves."""
+        return rms_of(self.judge, after) > np.exp(RIVAL) * rms_of(self.judge, before)
 
     def _simpler(self, search: Search, fit: Fit, names: list[str]) -> Fit:
         """Exchange an effect of many parameters for one or two with fewer in all, where it is not worth the difference:

@@ -33,6 +33,7 @@ class Criterion(Protocol):
     finished so many leading sets have their fits finished
     least    fall of the sum of squares below which the fit of a single effect is not finished
     left_out effects that help and are not to be named, and why
+    form     noise floors by which equations may be wrong: models that are no further apart do the same
     roams    the model's own parameters are known roughly: they are refitted at each start of an effect
     """
 
@@ -42,6 +43,7 @@ class Criterion(Protocol):
     fitted: int
     finished: int
     least: float
+    form: float
     roams: bool
     left_out: dict[str, str]
 
@@ -123,6 +125,7 @@ class Search:
         thetas: list[Array] = []
         owner: list[str] = []
         costs: list[float] = []
+        valley: list[int] = []  # from which place each set begins
         base_cost, plain = 0.0, 0
         for k, nominal in enumerate(self.nominal if roams else self.nominal[:1]):
             slopes = Linearisation(judge, nominal, self.base.free, self.base.prior)
@@ -145,6 +148,7 @@ class Search:
             thetas[first:] = [*some, *(theta for _, theta in better.values())]
             costs += [*left, *(cost for cost, _ in better.values())]
             owner += better
+            valley += [k] * (len(thetas) - first)
         out: dict[str, list[Array]] = {}
         self.reach: dict[str, float] = {}
         self.level: dict[str, float] = {}
@@ -153,6 +157,10 @@ class Search:
             # a second start is worth its time where it is nearly as good as the first
             near = mine[0][0] + 0.2 * max(base_cost - mine[0][0], 0.02 * base_cost)
             kept = [i for c, i in mine[:2] if roams or c <= near]
+            # of a valley that looks poor before the parameters follow, nobody knows whether the law leads on there
+            kept += [
+                next(i for _, i in mine if valley[i] == k) for k in set(valley) - {valley[i] for i in kept} if roams
+            ]
             # beside a model that is not fitted, slopes may promise what no fit keeps: one that is tried beside the base
             if roams and not any(i < plain for i in kept):
                 kept.append(next(i for _, i in mine if i < plain))
@@ -249,16 +257,16 @@ class Search:
         return dict(zip(names, self.judge.together([self._single(n) for n in names]), strict=True))
 
     def _followed(self, name: str) -> Task[float]:
-        """What a quick fit of an effect leaves, from the start that is best once the model's own parameters have
-        followed it; that fit and the starts then are where a fit begins.
+        """What the best of quick fits of an effect leaves, one from each start once the model's own parameters have
+        followed it; where these end is where a fit begins.
         """
         led = []
         for start in self.starts[name]:
-            led.append((yield from self.judge.leading((), start, 2)))
+            first = yield from self.judge.leading((), start, 2)
+            led.append((yield from self.judge.leading((name,), first.theta, 2)))
         led.sort(key=lambda of: of.total)
-        best = yield from self.judge.leading((name,), led[0].theta, 2)
-        self.starts[name] = [best.theta, *(of.theta for of in led[1:])]
-        return best.total
+        self.starts[name] = [of.theta for of in led]
+        return led[0].total
 
     def _begun(self, name: str) -> Task[Fit]:
         """The best of quick fits of an effect, one from each start."""

@@ -129,7 +129,9 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
             rows = [np.zeros(len(y[i])) for y in data.y]
         # a constant force and a constant in the sensor of a force are the same; so are gains
         named = any(p in (s.places or ()) for p in ("output", name))
-        leave = tuple(x for x in SIGNAL_LAWS if x not in SENSOR_OF_FORCE) if s.kind == "force" and not named else ()
+        leave: tuple[str, ...] = ("square",)  # no sensor reads a square alone; what drives a model may count squared
+        if s.kind == "force" and not named:
+            leave = tuple(x for x in SIGNAL_LAWS if x not in SENSOR_OF_FORCE)
         prefix = s.reading_of(name)
         add(prefix, "output", name, i, "signal", _size(data.records, rows, s.outputs[name]), leave)
     return out, effects
