@@ -118,6 +118,7 @@ NOT_RUN: dict[str, str] = {
     "vaneloop fleet": "needs the logs of many engines; tests/test_fleet_run.py, tests/test_fleet_report.py",
     "python -m benchmarks.fleet_demo": "simulates the logs of many engines; tests/test_fleet_report.py",
     "python -m benchmarks.hidden_effect": "draws and diagnoses logs for an hour; tests/test_hidden_effect.py",
+    "python -m benchmarks.two_actuators": "diagnoses logs for half an hour; tests/test_two_actuators_blind.py",
     "python -m benchmarks.hidden_law": "draws and diagnoses systems for an hour; tests/test_hidden_law.py",
     "python -m benchmarks.campaign": "measures for minutes; no test judges time",
     "python -m tests.corpus.make": "overwrites tests/corpus; tests/test_corpus.py compares it",

@@ -16,6 +16,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -642,6 +643,15 @@ def test_what_a_task_prints_is_written(tmp_path: Path, monkeypatch: pytest.Monke
         assert (tmp_path / "out").read_text() == "said False\nsaid True\n"
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """With SIGINT as Python has it, which a shell leaves ignored in what it runs in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_signals_go_on_to_the_controller_and_stops_are_waited_out() -> None:
     def asks(number: int) -> int:
         os.kill(os.getppid(), number)

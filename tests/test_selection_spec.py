@@ -37,7 +37,7 @@ FLOOR_KNOWN, NATS, RIVAL_NATS, RIVAL_SHARE = 0.01, 12.0, 3.0, 0.25
 PER_PARAMETER, RIVAL = 0.01, 0.05  # log error
 SAME_SIZE, SCREEN_LINE = (0.8, 1.25), (0.02, 5.0)  # times
 TRUST_MOST_LEFT, TRUST_MOST_FALL = 100.0, 30.0
-TRUST_COEFFICIENTS = {"noise_floor": (1.99, -0.01, 0.05, 0.0), "error_share": (0.57, -0.93, 1.23, 0.23)}
+TRUST_COEFFICIENTS = {"noise_floor": (-0.46, -0.75, 1.44, 0.23), "error_share": (0.57, -0.93, 1.23, 0.23)}
 
 N = 240
 T = 0.1 * np.arange(N)  # s

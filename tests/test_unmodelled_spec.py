@@ -619,7 +619,7 @@ def test_where_a_law_holds_is_said() -> None:
     spoken = replace(curve, spoken=formula, reach=(-4.0, 4.0))
     assert spoken.range_note() == (
         "y.curve_of_u: u has been in [-2, 2] V; the law file has the formula, which does as well as the curve; it "
-        "on to [-4, 4] V, and stays as there beyond"
+        "goes on to [-4, 4] V, and stays as there beyond"
     )
     always = replace(curve, spoken=Formula("constant", "3", {"a": 3.0}, 1.0, 1))
     assert always.constant and always.range_note().endswith("has the formula, which does as well as the curve")
