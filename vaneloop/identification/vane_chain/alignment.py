@@ -264,9 +264,11 @@ def _servo(stage: Stage) -> list[Late]:
         e = own - np.array(demanded(passed, c["x_dem"]))
         return e if late_stroke else e - np.outer(e @ shared, shared), np.array(demanded(passed, hidden))
 
-    delays = [rows * float(t[1] - t[0]) for rows in LOW_PASS_ROWS] + [-late_demand] * (late_demand < -LEAST_LATE)
-    begin = min((LowPass("second order", d, -late_demand - d) for d in delays), key=lambda x: _left(left_by(x)).min())
-    tried = min((_low_pass(begin._replace(kind=kind), left_by) for kind in LOW_PASSES), key=lambda x: x[0])
+    scanned = [LowPass("second order", d, -late_demand - d) for d in float(t[1] - t[0]) * np.array(LOW_PASS_ROWS)]
+    begins = [min(scanned, key=lambda x: _left(left_by(x)).min())]
+    if late_demand < -LEAST_LATE:
+        begins.append(LowPass("second order", -late_demand))
+    tried = min((_low_pass(x._replace(kind=kind), left_by) for x in begins for kind in LOW_PASSES), key=lambda x: x[0])
     # what is late may be so by a low-pass or by a clock, alike; what is not needs a reason to have passed one
     gain = chance if late_demand < -LEAST_LATE else max(chance, EXPLAINED * left)
     left, passed = tried if left - tried[0] > gain else (left, LowPass(late=-late_demand))
