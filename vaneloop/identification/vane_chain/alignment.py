@@ -416,11 +416,18 @@ def _one(
 
 
 def _both_behind(stage: Stage, passed: LowPass) -> tuple[Late, ...]:
-    """Stroke and vanes behind a low-pass that the controller's channels have passed, unless that leaves more."""
-    t, c = stage.t, stage.made.driven.columns  # type: ignore[attr-defined]
-    stroke = passed.before(c.get("stroke", c["x_lvdt"]), float(t[1] - t[0]))
-    _, before, after = _fit(stage, _moving(stage, lambda _: {"stroke": stroke}, passed), 0)
-    return (Late(("x_lvdt", *stage.outputs), 0.0, passed=passed),) if after.sum() < before.sum() else ()
+    """Stroke and vanes behind a low-pass that the controller's channels have passed, unless that leaves significantly
+    more, whatever the clock of the vanes.
+    """
+    t, c, by_clock = stage.t, stage.made.driven.columns, _by_clock(stage)  # type: ignore[attr-defined]
+
+    def left(passed: LowPass) -> Array:
+        stroke = passed.before(c.get("stroke", c["x_lvdt"]), float(t[1] - t[0]))
+        moved = _moving(stage, lambda late: {"stroke": _shifted(t, stroke, by_clock(late))}, passed)
+        return _fit(stage, moved, 2)[2]
+
+    worse = _significant(stage, left(passed), left(AS_LOGGED))
+    return () if worse else (Late(("x_lvdt", *stage.outputs), 0.0, passed=passed),)
 
 
 def _both_passed(stage: Stage) -> LowPass:
