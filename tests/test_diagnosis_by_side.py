@@ -208,7 +208,7 @@ def test_friction_of_one_side_is_that_sides_and_that_of_both_is_named_once() -> 
     assert one == {"actuator_a": [("side_a.piston_friction", [])]}
     two = found(built(Model(effects=FRICTION), len(T)))
     assert two == {"actuator_a": [("piston_friction", [])], "actuator_b": [("piston_friction", [])]}
-    unequal = Model(side_a=Side(effects=FRICTION), side_b=Side(effects={"piston_friction": {"force": 400.0}}))
+    unequal = Model(side_a=Side(effects=FRICTION), side_b=Side(effects={"piston_friction": {"force": 800.0}}))
     both = found(build_chain(logged(unequal), TWO))
     assert [name for names in both.values() for name, _ in names] == [
         "side_a.piston_friction",
