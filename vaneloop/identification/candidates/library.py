@@ -303,10 +303,10 @@ def _bouc_wen(z: Size) -> _Made:
 def _end_stop(z: Size) -> _Made:
     k, (low, high) = z.force / z.travel, z.ends
     r = high - low
-    ps = (
+    ps = (  # a third of the travel at least is free: a stop that is always touched is a spring, or a constant
         Parameter("stiffness", 0.0, f"({z.force_unit})/({z.travel_unit})", 0.0, 1e4 * k),
-        Parameter("low", low - r, z.travel_unit, low - r, high, shape=True),
-        Parameter("high", high + r, z.travel_unit, low, high + r, shape=True),
+        Parameter("low", low - r, z.travel_unit, low - r, low + r / 3.0, shape=True),
+        Parameter("high", high + r, z.travel_unit, high - r / 3.0, high + r, shape=True),
     )
     ways = [(d * r * a, d * r * b) for d in (0.1, 0.3) for a, b in ((1, 1), (1, 0), (0, 1))]  # how deep, on each side
     sides = [(low + a if a else low - r, high - b if b else high + r) for a, b in ways]

@@ -257,6 +257,8 @@ def _servo(stage: Stage) -> list[Late]:
     # the fewer channels have to move, the better
     near = [f for f in found if f[0] - best <= MOVES_ALIKE * (as_is - best)]
     left, late_demand, late_stroke = min(near, key=lambda f: (f[2] != 0.0, f[0]))
+    if as_is - max(left, noise) < max(EXPLAINED * (as_is - noise), chance):
+        return []
     # all else is behind a low-pass, maybe, whose recorder's clock may be early by more than that
     own = current[None] - np.array(strokes(np.array([late_stroke]))[0])
 
@@ -271,9 +273,7 @@ def _servo(stage: Stage) -> list[Late]:
     tried = min((_low_pass(x._replace(kind=kind), left_by) for x in begins for kind in LOW_PASSES), key=lambda x: x[0])
     # what is late may be so by a low-pass or by a clock, alike; what is not needs a reason to have passed one
     gain = chance if late_demand < -LEAST_LATE else max(chance, EXPLAINED * left)
-    left, passed = tried if left - tried[0] > gain else (left, LowPass(late=-late_demand))
-    if as_is - max(left, noise) < max(EXPLAINED * (as_is - noise), chance):
-        return []
+    passed = tried[1] if left - tried[0] > gain else LowPass(late=-late_demand)
     lates = (Late(DEMAND, -passed.delay - passed.late, passed=passed), Late(("x_lvdt",), late_stroke))
     return [one for one in lates if one.seconds or one.passed.kind]
 
