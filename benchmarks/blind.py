@@ -1,4 +1,4 @@
-"""What the two blind benchmarks share: a run that goes on where it was stopped, what a learned curve is, shares."""
+"""What the blind benchmarks share: a run that goes on where it was stopped, what a learned curve is, shares."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from vaneloop.base.errors import InputError
 from vaneloop.base.files import whole
 
 __all__ = [
-    "INSIDE", "KINDS", "add_learn_options", "add_run_options", "as_curve", "print_shares", "read_rows", "run", "share",
-    "write_rows",
+    "INSIDE", "KINDS", "add_learn_options", "add_result_options", "add_run_options", "as_curve", "check_run",
+    "print_shares", "read_rows", "run", "share", "write_rows",
 ]  # fmt: skip
 
 Row = dict[str, Any]
@@ -47,6 +47,11 @@ def add_run_options(parser: argparse.ArgumentParser, what: str, one: str, out: s
         "--kinds", nargs="+", choices=KINDS, default=list(KINDS), metavar="KIND",
         help=f"draw only {what} of these kinds: {', '.join(KINDS)} (default: all)",
     )  # fmt: skip
+    add_result_options(parser, what, one, out)
+
+
+def add_result_options(parser: argparse.ArgumentParser, what: str, one: str, out: str) -> None:
+    """Declare by how many workers ``what`` (``one`` of them) are diagnosed, and the file of the results."""
     parser.add_argument(
         "--workers", type=int, default=2, metavar="N", help=f"{what} diagnosed side by side (default 2)"
     )
@@ -54,6 +59,17 @@ def add_run_options(parser: argparse.ArgumentParser, what: str, one: str, out: s
         "--out", metavar="F.parquet", default=out, help=f"results, a row a {one}; an existing file is continued"
     )
     terminal.add_output_options(parser)
+
+
+def check_run(args: argparse.Namespace, what: str) -> None:
+    """Refuse a number of ``what``, workers or a seed that no run can have: InputError."""
+    many = getattr(args, what)
+    if not 1 <= many <= 100_000:
+        raise InputError(f"--{what} (={many}) must be in [1, 100000]")
+    if not 1 <= args.workers <= 64:
+        raise InputError(f"--workers (={args.workers}) must be in [1, 64]")
+    if args.seed is not None and not 0 <= args.seed < 2**63:
+        raise InputError(f"--seed (={args.seed}) must be in [0, 2^63)")
 
 
 def run(

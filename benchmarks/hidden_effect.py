@@ -25,6 +25,7 @@ from benchmarks.blind import (
     add_learn_options,
     add_run_options,
     as_curve,
+    check_run,
     print_shares,
     read_rows,
     run,
@@ -613,14 +614,9 @@ def _machine(table: str) -> str:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    if not 1 <= args.logs <= 100_000:
-        raise InputError(f"--logs (={args.logs}) must be in [1, 100000]")
-    if not 1 <= args.workers <= 64:
-        raise InputError(f"--workers (={args.workers}) must be in [1, 64]")
+    check_run(args, "logs")
     if not 30.0 <= args.duration <= 1e5:
         raise InputError(f"--duration (={args.duration:g} s) must be in [30, 1e5]")
-    if args.seed is not None and not 0 <= args.seed < 2**63:
-        raise InputError(f"--seed (={args.seed}) must be in [0, 2^63)")
     machine, path = _machine(args.plant), Path(args.out)
     rows = read_rows(path, "hidden_effect") if path.exists() else []
     seed = args.seed if args.seed is not None else (rows[0]["seed"] if rows else secrets.randbelow(2**31))

@@ -24,6 +24,7 @@ from benchmarks.blind import (
     add_learn_options,
     add_run_options,
     as_curve,
+    check_run,
     print_shares,
     read_rows,
     run,
@@ -422,12 +423,7 @@ def command(args: argparse.Namespace) -> int:
     for name in args.family:
         if name not in rig.FAMILIES:
             raise InputError(f"--family {name!r}: not a family; allowed: {', '.join(rig.FAMILIES)}")
-    if not 1 <= args.systems <= 100_000:
-        raise InputError(f"--systems (={args.systems}) must be in [1, 100000]")
-    if not 1 <= args.workers <= 64:
-        raise InputError(f"--workers (={args.workers}) must be in [1, 64]")
-    if args.seed is not None and not 0 <= args.seed < 2**63:
-        raise InputError(f"--seed (={args.seed}) must be in [0, 2^63)")
+    check_run(args, "systems")
     families, path = tuple(dict.fromkeys(args.family)), Path(args.out)
     rows = _before(path, families)
     seed = args.seed if args.seed is not None else (rows[0]["seed"] if rows else secrets.randbelow(2**31))

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import start
-from benchmarks.blind import print_shares, read_rows, run, share
+from benchmarks.blind import add_result_options, check_run, print_shares, read_rows, run, share
 from hil.logs import Channel, Log
 from hil.loop.lockstep import Stimulus, lockstep, warm_up
 from plant import Model, build_plant
@@ -68,12 +68,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--logs", type=int, default=40, metavar="N", help="number of logs (default 40)")
     parser.add_argument("--seed", type=int, metavar="S", help="seed of the draw (default: fresh, and printed)")
     parser.add_argument("--duration", type=float, default=120.0, metavar="S", help="length of each log (default 120 s)")
-    parser.add_argument("--workers", type=int, default=2, metavar="N", help="logs diagnosed side by side (default 2)")
-    parser.add_argument(
-        "--out", metavar="F.parquet", default="out/two_actuators.parquet",
-        help="results, a row a log; an existing file is continued",
-    )  # fmt: skip
-    terminal.add_output_options(parser)
+    add_result_options(parser, "logs", "log", "out/two_actuators.parquet")
 
 
 def draw_case(seed: int, index: int, duration: float = 120.0) -> dict[str, Any]:
@@ -178,14 +173,9 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def command(args: argparse.Namespace) -> int:
     """Run from parsed options; return the exit code."""
-    if not 1 <= args.logs <= 100_000:
-        raise InputError(f"--logs (={args.logs}) must be in [1, 100000]")
-    if not 1 <= args.workers <= 64:
-        raise InputError(f"--workers (={args.workers}) must be in [1, 64]")
+    check_run(args, "logs")
     if not 30.0 <= args.duration <= 3600.0:
         raise InputError(f"--duration (={args.duration:g} s) must be in [30, 3600]")
-    if args.seed is not None and not 0 <= args.seed < 2**63:
-        raise InputError(f"--seed (={args.seed}) must be in [0, 2^63)")
     path = Path(args.out)
     rows = read_rows(path, "two_actuators") if path.exists() else []
     seed = args.seed if args.seed is not None else (rows[0]["seed"] if rows else secrets.randbelow(2**31))

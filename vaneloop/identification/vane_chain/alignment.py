@@ -34,8 +34,8 @@ from vaneloop.identification.vane_chain.resample import Grid, first_row, last_di
 from vaneloop.identification.vane_chain.subsystem_data import VANES_LATE, Made
 
 __all__ = [
-    "Late", "LateIn", "aligned", "demand_of", "driving", "explains", "late_in_controller", "late_vanes", "on_rows",
-    "passed_by", "vanes_late",
+    "Late", "LateIn", "aligned", "demand_of", "driving", "explains", "fits", "late_in_controller", "late_vanes",
+    "on_rows", "passed_by", "vanes_late",
 ]  # fmt: skip
 
 Both = tuple[Array, Array]  # the mean of a row's ticks, and the last of them
@@ -158,7 +158,7 @@ def late_vanes(stages: Sequence[Stage]) -> LateIn:
     """
     of = _judged(stages)
     stage = of.get("linkage")
-    if stage is None or len(stage.outputs) < 2 or _fits(stage):
+    if stage is None or len(stage.outputs) < 2 or fits(stage):
         return {}
     t, c = stage.t, stage.made.driven.columns  # type: ignore[attr-defined]
     length, middle, by_clock = float(np.ptp(t)), 0.5 * float(t[0] + t[-1]), _by_clock(stage)
@@ -198,7 +198,7 @@ def _servo(stage: Stage) -> list[Late]:
     noise is projected out, and what the demand's rounding makes is taken off the squares: both would favour what
     smooths most.
     """
-    if _fits(stage):
+    if fits(stage):
         return []
     driven = stage.made.driven  # type: ignore[attr-defined]
     t, c, cal = driven.t, driven.columns, driven.calibration
@@ -400,7 +400,7 @@ def _one(
 ) -> tuple[Late, ...]:
     """One offset of ``channels`` that drive a stage against all else in it, which may have ``passed`` a low-pass."""
     t, c = stage.t, stage.made.driven.columns  # type: ignore[attr-defined]
-    if _fits(stage) and not passed.kind:
+    if fits(stage) and not passed.kind:
         return ()
 
     def of(late: Array) -> dict[str, Array]:
@@ -434,7 +434,7 @@ def _both_passed(stage: Stage) -> LowPass:
     """The low-pass that stroke and vanes have both passed, where no servo tells: what it takes off the stroke's turns
     the play keeps, which no offset does.
     """
-    if _fits(stage):
+    if fits(stage):
         return AS_LOGGED
     t, c = stage.t, stage.made.driven.columns  # type: ignore[attr-defined]
     dt, by_clock = float(t[1] - t[0]), _by_clock(stage)
@@ -463,7 +463,7 @@ def _both_passed(stage: Stage) -> LowPass:
 
 def _lvdt_lag(stage: Stage, start: float) -> float:
     """The lag (s) of the LVDT, beyond the nominal one, that suits the actuator best, from one to ``start`` with."""
-    if "lvdt_lag" not in stage.index() or _fits(stage):
+    if "lvdt_lag" not in stage.index() or fits(stage):
         return 0.0
     judge, begin = LeastSquaresProblem(stage, np.asarray(stage.floor)), stage.neutral()
     at = stage.index()["lvdt_lag"].start
@@ -471,7 +471,7 @@ def _lvdt_lag(stage: Stage, start: float) -> float:
     return float(judge.fit(("lvdt_lag",), begin, 4).theta[at])
 
 
-def _fits(stage: Stage) -> bool:
+def fits(stage: Stage) -> bool:
     """Whether no search would begin."""
     judge = LeastSquaresProblem(stage, np.asarray(stage.floor))
     return not LikelihoodAcceptance(judge).fails(recalibrate(judge))

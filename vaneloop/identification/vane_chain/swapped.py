@@ -14,9 +14,8 @@ import numpy as np
 
 from vaneloop.base.signals import SIDES
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
-from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
 from vaneloop.identification.subsystem import Stage
-from vaneloop.identification.vane_chain.alignment import explains
+from vaneloop.identification.vane_chain.alignment import explains, fits
 from vaneloop.identification.vane_chain.subsystem_data import Made, stroke_of
 
 __all__ = ["swapped"]
@@ -28,9 +27,9 @@ def swapped(stages: Sequence[Stage]) -> list[str]:
     """
     of = {s.name: s for s in stages if s.floor is not None and isinstance(s.made, Made)}
     stage = of.get("linkage")
-    if stage is None or stage.made.driven.both is None or not _fails(stage):  # type: ignore[attr-defined]
+    if stage is None or stage.made.driven.both is None or fits(stage):  # type: ignore[attr-defined]
         return []
-    if any(_fails(s) for name, s in of.items() if name.startswith("actuator_")):
+    if any(not fits(s) for name, s in of.items() if name.startswith("actuator_")):
         return []
     made = stage.made
     assert isinstance(made, Made)
@@ -49,11 +48,6 @@ def swapped(stages: Sequence[Stage]) -> list[str]:
         f"{a}, {b}: each seems to stand in the other's place in the log: with both exchanged the error of the vane "
         f"angles falls from {falls} noise floors, and both actuators fit either way"
     ]
-
-
-def _fails(stage: Stage) -> bool:
-    judge = LeastSquaresProblem(stage, np.asarray(stage.floor))
-    return LikelihoodAcceptance(judge).fails(recalibrate(judge))
 
 
 def _mean_squares(stage: Stage, of: Stage) -> np.ndarray:
