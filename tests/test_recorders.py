@@ -223,7 +223,9 @@ def test_noise_of_an_input_that_its_filter_makes_slow_is_in_the_floor():
 
 def test_what_a_last_digit_hides_is_one_error_as_long_as_it_stands():
     t, x = np.arange(40_000) * 0.01, 0.05 * np.repeat(np.arange(400.0), 100)
-    stands = _other_noise(t, x)(np.random.default_rng(1)).reshape(400, 100).mean(axis=1)  # what else is in it is white
+    stands = (
+        _other_noise(t, x, 0.05)(np.random.default_rng(1)).reshape(400, 100).mean(axis=1)
+    )  # what else is in it is white
     assert np.std(stands) == pytest.approx(0.05 / 12.0**0.5, rel=0.1)
     assert np.abs(np.corrcoef(stands[1:], stands[:-1])[0, 1]) < 0.15
 

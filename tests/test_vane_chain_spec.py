@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy
 
 from controller import load_calibration
 from hil.logs import Channel, Log, LogError
@@ -102,6 +103,7 @@ from vaneloop.identification.vane_chain.resample import (
     Grid,
     every_other,
     grid_of,
+    last_digit,
     lately,
     no_gap_in_window,
     on_raster,
@@ -1042,7 +1044,7 @@ def test_the_stroke_without_its_noise_and_the_law_on_it_are_as_far_off_as_is_sai
         draws = [smooth.left(np.random.default_rng(s), np.zeros(len(t))) + smooth.distortion for s in range(4)]
         said = [np.std(d[100:-100]) for d in draws]
         assert left < 0.45 * sigma and np.sqrt(np.mean(np.square(said))) == pytest.approx(left, rel=0.15)
-    law, of_mean, of_some = servo_law(t, c | {"x_lvdt": x}, CALIBRATION, smooth, draws=4, samples=2)
+    law, of_mean, of_some = servo_law(t, c | {"x_lvdt": x}, CALIBRATION, smooth, {}, draws=4, samples=2)
     unknown = sigma * white(9, len(t), 10)
     unknown[:, -1] = 0.0  # at the row it is logged
     true = law_of(c["x_dem"], known.stroke, CALIBRATION, logged=x) - k.kp * unknown
@@ -1054,7 +1056,7 @@ def test_the_stroke_without_its_noise_and_the_law_on_it_are_as_far_off_as_is_sai
     assert [size(d) for d in of_mean.T] == pytest.approx([size(true.mean(axis=1) - law.mean(axis=1))] * 4, rel=0.08)
     assert [size(d) for d in of_some.T] == pytest.approx([size(samples_of(true - law, 2))] * 4, rel=0.08)
     assert size(law[:, -1] - true[:, -1]) < 0.3 * k.kp * sigma
-    again = servo_law(t, c | {"x_lvdt": x}, CALIBRATION, smooth, draws=2)
+    again = servo_law(t, c | {"x_lvdt": x}, CALIBRATION, smooth, {}, draws=2)
     assert np.array_equal(again[0], law) and np.array_equal(again[1], of_mean[:, :2])
 
 
@@ -1135,10 +1137,10 @@ def test_noise_of_an_input_counts_as_an_error_as_far_as_it_is_seen() -> None:
     t, grid = 0.01 * np.arange(6000), 0.5
     values = np.round(40.0 * np.sin(0.02 * t) / grid) * grid
     for seed in range(3):  # a digit: even over one step, and the same as long as the value is
-        draw = _other_noise(t, values)(np.random.default_rng(seed))
+        draw = last_digit(values, grid)(np.random.default_rng(seed))
         assert np.abs(draw).max() <= 0.5 * grid and np.ptp(draw) > 0.9 * grid
         assert not np.diff(draw)[np.diff(values) == 0.0].any()
-    of = _other_noise(t, np.sin(t) + 0.2 * white(3, 6000))
+    of = _other_noise(t, np.sin(t) + 0.2 * white(3, 6000), 0.0)
     one, two = (of(np.random.default_rng(seed)) for seed in (0, 1))
     assert one.std() == pytest.approx(0.2, rel=0.05) and abs(np.corrcoef(one, two)[0, 1]) < 0.05
     makes = np.array([white(k, 6000) for k in (1, 2, 3)])
@@ -1482,6 +1484,34 @@ def test_a_log_faster_than_the_frames_begins_with_one() -> None:
     assert still.start == 7.0  # one change tells no phase
     moves = grid_of(log_of(t, x_dem=t, n_dem=t, n_r=t, x_lvdt=t))
     assert moves.start == 7.0  # what changes with every sample came in no frames
+
+
+@pytest.mark.parametrize("begins", range(5))
+def test_what_comes_in_frames_behind_a_low_pass_is_read_where_it_has_settled(begins: int) -> None:
+    """Every 2 ms a sample of a speed that is sent every 10 ms, each with its noise, behind a lag of 1.5 ms."""
+    t = 0.002 * np.arange(15_000)
+    sent = (np.arange(len(t)) - begins) // 5
+    noise = white(4, 3001)
+    held = 60.0 + 0.001 * sent + noise[sent + 1]
+    lagged = scipy.signal.lfilter([1.0 - np.exp(-2.0 / 1.5)], [1.0, -np.exp(-2.0 / 1.5)], held - 60.0) + 60.0
+    log = log_of(t, n_dem=60.0 + 0.0 * t, n_r=lagged, x_lvdt=white(6, len(t)))
+    rows, columns, _, _ = on_raster(log, grid_of(log))
+    there = sent[np.rint((rows + log.channels["n_r"].t[0]) / 0.002).astype(int)]
+    e = columns["n_r"] - (60.0 + 0.001 * there + noise[there + 1])
+    assert np.std(e[10:-10]) < 0.05
+    same = columns["x_lvdt"]  # no frames: each row its own sample
+    assert np.array_equal(same, log.channels["x_lvdt"].values[::5][: len(same)])
+
+
+def test_the_last_digit_is_that_of_the_file_whatever_is_worked_out_of_it() -> None:
+    t = 0.01 * np.arange(3000)
+    x = np.round(50.0 + 20.0 * np.sin(t), 2)
+    log = log_of(t, n_dem=x, n_r=x, x_dem=x, x_lvdt=np.sin(t))
+    assert grid_of(log).digits == pytest.approx({"n_dem": 0.01, "x_dem": 0.01, "n_r": 0.01, "x_lvdt": 0.0})
+    kept = np.ones(3000, dtype=bool)
+    kept[np.random.default_rng(1).integers(0, 3000, 400)] = False  # rows between those left are no multiples
+    lost = log_of(t[kept], n_dem=x[kept], n_r=x[kept], x_dem=x[kept])
+    assert grid_of(lost).digits["x_dem"] == pytest.approx(0.01)
 
 
 def test_samples_of_another_clock_are_joined_and_a_jitter_is_not() -> None:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +29,7 @@ from vaneloop.identification.least_squares.problem import LeastSquaresProblem, r
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
 from vaneloop.identification.settings import COLOUR, EXPLAINED, LATE, LOW_PASS_ROWS, MOVES_ALIKE, NATS, RASTER, WINDOW
 from vaneloop.identification.subsystem import Array, Stage
-from vaneloop.identification.vane_chain.current import law_of
+from vaneloop.identification.vane_chain.current import LOGGED_CURRENT, law_of, taken
 from vaneloop.identification.vane_chain.low_pass import AS_LOGGED, LOW_PASSES, LowPass
 from vaneloop.identification.vane_chain.resample import Grid, first_row, last_digit
 from vaneloop.identification.vane_chain.subsystem_data import VANES_LATE, Made
@@ -38,7 +39,7 @@ __all__ = [
     "on_rows", "passed_by", "vanes_late",
 ]  # fmt: skip
 
-Both = tuple[Array, Array]  # the mean of a row's ticks, and the last of them
+Sampled = tuple[Array, ...]  # a row's current by each of the ways in which a logger may take it from its ten ticks
 LateIn = Mapping[str, tuple["Late", ...]]  # subsystem -> what stands late in it, against what it explains
 DEMAND, DRIVING = ("x_dem",), ("n_r", "n_dem")
 LEAST_LATE = chain.TICK  # s; the controller does nothing between two ticks
@@ -194,9 +195,9 @@ def _shifted(t: Array, values: Array, late: float | Array) -> Array:
 def _servo(stage: Stage) -> list[Late]:
     """Stroke demand and stroke against the current, by the firmware's law, which is linear in both.
 
-    The current is the mean of the ticks since the row before or that of the last. What it has in common with a row's
-    noise is projected out, and what the demand's rounding makes is taken off the squares: both would favour what
-    smooths most.
+    The current is `taken` from the ticks since the row before in any way that a logger may. What it has in common with
+    a row's noise is projected out, and what the demand's rounding makes is taken off the squares: both would favour
+    what smooths most. How large that is, is known to a half.
     """
     if fits(stage):
         return []
@@ -211,93 +212,104 @@ def _servo(stage: Stage) -> list[Late]:
         v = values[use]
         return np.asarray(v - (np.bincount(window, v) / np.maximum(np.bincount(window), 1))[window])
 
-    def both(ticks: Array) -> tuple[Array, Array]:
-        return centred(ticks.mean(axis=1)), centred(ticks[:, -1])
+    def sampled(ticks: Array) -> Sampled:
+        return tuple(centred(one) for one in taken(ticks, driven.samples).values())
 
-    none, current, stroke = np.zeros(len(t)), centred(c["i_cmd"]), c["stroke"]
+    none, current, stroke = np.zeros(len(t)), centred(c.get(LOGGED_CURRENT, c["i_cmd"])), c["stroke"]
     # of a row's noise the controller saw what is the sensor's, and not what is the recorder's: a share of it
     shared = centred(c["x_lvdt"] - stroke)
     shared /= max(float(np.linalg.norm(shared)), 1e-300)
 
     # and what the demand's last digit hides the controller knew
-    hidden = last_digit(c["x_dem"])(np.random.default_rng(0))
+    hidden = last_digit(c["x_dem"], driven.digit("x_dem"))(np.random.default_rng(0))
 
-    def demanded(passed: LowPass, x_dem: Array) -> Both:
-        return both(law_of(x_dem, none, cal, behind=passed))
+    def demanded(passed: LowPass, x_dem: Array) -> Sampled:
+        return sampled(law_of(x_dem, none, cal, behind=passed))
 
-    def demands(late: Array) -> list[Both]:
-        return [demanded(LowPass(late=-float(d)), c["x_dem"]) for d in late]
+    @cache
+    def demand(ticks: float) -> tuple[Sampled, Array]:
+        """What the law makes of a demand that is late, and the power of what it makes of its rounding."""
+        late = LowPass(late=-ticks * LEAST_LATE)
+        return demanded(late, c["x_dem"]), np.array([h @ h for h in demanded(late, hidden)])
 
-    def strokes(late: Array) -> list[Both]:
-        return [both(law_of(none, _shifted(t, stroke, d), cal)) for d in late]
+    @cache
+    def own_stroke(ticks: float) -> Sampled:
+        return sampled(law_of(none, _shifted(t, stroke, ticks * LEAST_LATE), cal))
 
-    def least(last: int, late: Array, other: Array, d: Sequence[Both], x: Sequence[Both]) -> tuple[float, float, float]:
-        left = current[None] - np.array([one[last] for one in d])
-        own = np.array([one[last] for one in x])
+    def least(kind: int, late: Array, other: Array) -> tuple[float, float, float, float]:
+        """The least power that demand and stroke leave which are late by these ticks; what the rounding makes, which is
+        taken off it; and by how much they are.
+        """
+        d = [demand(float(one)) for one in late]
+        left = current[None] - np.array([one[kind] for one, _ in d])
+        own = np.array([own_stroke(float(one))[kind] for one in other])
         power = np.sum(left**2, axis=1)[:, None] - 2.0 * left @ own.T + np.sum(own**2, axis=1)[None]
         power -= np.where(other == 0.0, (left @ shared)[:, None] - (own @ shared)[None], 0.0) ** 2
-        power -= hides[last]
+        power -= (hides := np.array([hides[kind] for _, hides in d])[:, None])
         j, k = np.unravel_index(int(np.argmin(power)), power.shape)
-        return float(power[j, k]), float(late[j]), float(other[k])
+        return float(power[j, k]), float(hides[j, 0]), float(late[j]), float(other[k])
 
-    step = 0.1 * LATE
-    grid, fine, here = step * np.arange(-10, 11), step * np.arange(-8, 9) / 8.0, np.zeros(1)
-    as_logged = (demands(here), strokes(here))
-    hides = [float(x @ x) for x in demanded(AS_LOGGED, hidden)]
-    as_is = min(least(last, here, here, *as_logged)[0] for last in (0, 1))
-    found = [(as_is, 0.0, 0.0)]
-    d, x = demands(grid), strokes(grid)
-    for last in (0, 1):
-        _, late, _ = least(last, grid, here, d, as_logged[1])
-        found.append(least(last, late + fine, here, demands(late + fine), as_logged[1]))
-        _, late, other = least(last, grid, grid, d, x)
-        found.append(least(last, late + fine, other + fine, demands(late + fine), strokes(other + fine)))
-    best, chance = min(found)[0], _chance(float(stage.floor[0]) ** 2)  # type: ignore[index]
-    noise = float(stage.floor[0]) ** 2 * len(current)  # type: ignore[index]
+    def less(before: Sequence[float], after: Sequence[float]) -> float:
+        """By how much a power is less than before, at least; both with what the rounding makes."""
+        return before[0] - after[0] - EXPLAINED * abs(before[1] - after[1])
+
+    step, here = 0.1 * LATE / LEAST_LATE, np.zeros(1)
+    around = step * np.arange(-8, 9) / 8.0
+    kinds = range(len(own_stroke(0.0)))
+    as_is = min(least(kind, here, here) for kind in kinds)
+    found = [(0.0, 0.0, 0.0)]
+    for kind in kinds:
+        for both in (0.0, 1.0):
+            *left, late, other = least(kind, step * np.arange(-10, 11), both * step * np.arange(-10, 11))
+            for fine in (around, around / 8.0):
+                *left, late, other = least(kind, late + fine, other + both * fine)
+            found.append((less(as_is, left), late * LEAST_LATE, other * LEAST_LATE))
+    chance = _chance(float(stage.floor[0]) ** 2)  # type: ignore[index]
+    excess = as_is[0] + as_is[1] - float(stage.floor[0]) ** 2 * len(current)  # type: ignore[index]
     # the fewer channels have to move, the better
-    near = [f for f in found if f[0] - best <= MOVES_ALIKE * (as_is - best)]
-    left, late_demand, late_stroke = min(near, key=lambda f: (f[2] != 0.0, f[0]))
-    if as_is - max(left, noise) < max(EXPLAINED * (as_is - noise), chance):
+    near = [f for f in found if f[0] >= (1.0 - MOVES_ALIKE) * max(found)[0]]
+    gain, late_demand, late_stroke = min(near, key=lambda f: (f[2] != 0.0, -f[0]))
+    if min(gain, excess) < max(EXPLAINED * excess, chance):
         return []
     # all else is behind a low-pass, maybe, whose recorder's clock may be early by more than that
-    own = current[None] - np.array(strokes(np.array([late_stroke]))[0])
+    own = current[None] - np.array(own_stroke(late_stroke / LEAST_LATE))
 
     def left_by(passed: LowPass) -> tuple[Array, Array]:
         e = own - np.array(demanded(passed, c["x_dem"]))
         return e if late_stroke else e - np.outer(e @ shared, shared), np.array(demanded(passed, hidden))
 
     scanned = [LowPass("second order", d, -late_demand - d) for d in float(t[1] - t[0]) * np.array(LOW_PASS_ROWS)]
-    begins = [min(scanned, key=lambda x: _left(left_by(x)).min())]
+
+    def powers(passed: LowPass) -> tuple[float, float]:
+        of, by_noise = (np.sum(x**2, axis=1) for x in left_by(passed))
+        return min(zip(of - by_noise, by_noise, strict=True))
+
+    begins = [min(scanned, key=powers)]
     if late_demand < -LEAST_LATE:
         begins.append(LowPass("second order", -late_demand))
     tried = min((_low_pass(x._replace(kind=kind), left_by) for x in begins for kind in LOW_PASSES), key=lambda x: x[0])
     # what is late may be so by a low-pass or by a clock, alike; what is not needs a reason to have passed one
-    gain = chance if late_demand < -LEAST_LATE else max(chance, EXPLAINED * left)
-    passed = tried[1] if left - tried[0] > gain else LowPass(late=-late_demand)
+    by_clock = powers(LowPass(late=-late_demand))
+    least_gain = chance if late_demand < -LEAST_LATE else max(chance, EXPLAINED * by_clock[0])
+    passed = tried[1] if less(by_clock, powers(tried[1])) > least_gain else LowPass(late=-late_demand)
     lates = (Late(DEMAND, -passed.delay - passed.late, passed=passed), Late(("x_lvdt",), late_stroke))
     return [one for one in lates if one.seconds or one.passed.kind]
-
-
-def _left(errors: tuple[Array, Array]) -> Array:
-    """Sum of squares of errors, less that of what noise makes of them: each float64[kinds of sample, values]."""
-    of, by_noise = errors
-    return np.asarray(np.sum(of**2, axis=1) - np.sum(by_noise**2, axis=1))
 
 
 def _low_pass(begin: LowPass, errors: Callable[[LowPass], tuple[Array, Array]]) -> tuple[float, LowPass]:
     """The low-pass of the kind of ``begin``, and how late it stands besides, that leave least near that. Returns what
     is left, squared, and it.
 
-    errors  what a low-pass leaves, and what it makes of a draw of the noise of what passed it, each float64[kinds of
-            sample, values]. Least squares of the first less those of the second: else the low-pass that takes most off
-            the noise would be the best (Soederstroem, Automatica 43 (2007) 939, bias-compensated least squares)
+    errors  what a low-pass leaves, and what it makes of a draw of the noise of what passed it, each float64[ways
+            to sample, values]. Least squares of the first less those of the second: else the low-pass that takes most
+            off the noise would be the best (Soederstroem, Automatica 43 (2007) 939, bias-compensated least squares)
     """
 
     def of(at: Array) -> LowPass:
         return begin._replace(delay=float(at[0]), late=float(at[1]))
 
     found = []
-    for sample in (0, 1):
+    for sample in range(len(errors(begin)[0])):
         at, best = np.array([begin.delay, begin.late]), (np.inf, AS_LOGGED)
         for _ in range(4):
             e, noise_of = (x[sample] for x in errors(of(at)))

@@ -164,11 +164,12 @@ def build_chain(
     draws    of what the log hides from the servo
     late     what stands late in the log, where that is known; None: it is to be found
     """
-    log = without_hum(with_mean_stroke(log, plant or build_plant()))
+    log = with_mean_stroke(log, plant or build_plant())
+    grid = grid or grid_of(log)
+    log = without_hum(log)
     known = late or {}
     framed = any(c.framed for c in log.channels.values())  # frames are stamped by one clock
     chain = _build(log, plant, calibration, present, grid, pieces, draws, known)
-    noisy = expect_stationary_noise(chain.stages) if late is not None or framed else []
     known_clocks = late is not None or framed or chain.plant.sides > 1
     noisy = expect_stationary_noise(chain.stages) if known_clocks else []
     for find in () if known_clocks else (late_in_controller, late_vanes):
@@ -243,7 +244,7 @@ def _build(
     plant: Plant | None,
     calibration: Calibration | None,
     present: tuple[str, ...],
-    grid: Grid | None,
+    grid: Grid,
     pieces: Sequence[tuple[int, int]],
     draws: int,
     late: LateIn,
@@ -256,7 +257,6 @@ def _build(
         raise LogError(f"{log.path}: actuators.feed (='one valve') must be 'a valve each' for judging subsystems")
     if tables.channels is not None:
         raise LogError(f"{log.path}: channels.number (=2) must be 1 for judging subsystems (docs/channels.md)")
-    grid = grid or grid_of(log)
     absent: dict[str, str] = {}
     # subsystems that have the same rows, and the same channels late
     together: dict[tuple[tuple[tuple[int, int], ...], tuple[Late, ...]], list[str]] = {}
@@ -402,10 +402,10 @@ def _chain(
         rough = Driven(t, have, machine, cal, (), motion.usable, (), turns=partial(reversals, t, have["x_lvdt"], full))
         motor = machine if machine.sides == 1 else machine.alone(0)  # both of two move nearly alike
         smooth = without_noise(t, have, motor, rough.slipping(rough.signals(), machine.p))
+    samples = min(10, max(1, round(dt / grid.steps.get("i_cmd", dt))))
     if dt < 1.5 * RASTER and {"x_lvdt", "i_cmd"} <= columns.keys():
         if "x_dem" in columns and not theirs and {"servo", "actuator"} & set(names):
-            samples = min(10, max(1, round(dt / grid.steps["i_cmd"])))
-            law, *off = servo_law(t, have, cal, smooth, draws, samples, behind)
+            law, *off = servo_law(t, have, cal, smooth, grid.digits, draws, samples, behind)
             what = other_current(t, have, law, both.run, cal, samples)
             if what:
                 notes.append(
@@ -414,7 +414,7 @@ def _chain(
                 )
                 columns["i_cmd"] = have["i_cmd"]
                 smooth = without_noise(t, have, motor, rough.slipping(rough.signals(), machine.p))
-                law, *off = servo_law(t, have, cal, smooth, draws, samples, behind)
+                law, *off = servo_law(t, have, cal, smooth, grid.digits, draws, samples, behind)
             sampled = what == SAMPLED
             have["law"], have["law_error"] = law, off[1] if sampled else off[0]
             unknown = off[0][:, 0] - off[1][:, 0] if sampled else None
@@ -428,8 +428,8 @@ def _chain(
         for side, name in enumerate(SIDES):
             smooth_of[name] = without_noise(t, {**have, "x_lvdt": columns[name]}, machine.alone(side))
             have[stroke_of(name)] = smooth_of[name].stroke
-    if "linkage" in names and "x_lvdt" in have and resolution(have["x_lvdt"]):
-        digit = last_digit(have["x_lvdt"])
+    if "linkage" in names and "x_lvdt" in have and grid.digits.get("x_lvdt"):
+        digit = last_digit(have["x_lvdt"], grid.digits["x_lvdt"])
         digits = (digit(np.random.default_rng(k)) for k in range(NOISE_DRAWS))
         off_by = (smooth.smoothed(d) if "stroke" in have else d for d in digits)
         have[STROKE_OFF] = np.array([passed.before(d, dt) for d in off_by]).T
@@ -468,7 +468,7 @@ def _chain(
         told = name == "demand" and bool(pieces)
         driven = Driven(
             t, dict(have), machine, cal, outputs, rows, present, turns=turns, assumed=assumed, passed=passed,
-            again=told, side=ACTUATORS.get(name),
+            again=told, side=ACTUATORS.get(name), digits=grid.digits, samples=samples,
         )  # fmt: skip
         make = make_of[name]
         stage = make(driven)

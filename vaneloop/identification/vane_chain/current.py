@@ -36,12 +36,13 @@ from vaneloop.identification.vane_chain.low_pass import AS_LOGGED, LowPass, lagg
 from vaneloop.identification.vane_chain.resample import last_digit
 
 __all__ = [
-    "BEFORE", "SAMPLED", "SLOW_CURRENTS", "Smooth", "between_rows", "law_of", "other_current", "samples_of",
-    "servo_law", "without_noise",
+    "BEFORE", "LOGGED_CURRENT", "SAMPLED", "SLOW_CURRENTS", "Smooth", "between_rows", "law_of", "other_current",
+    "samples_of", "servo_law", "taken", "without_noise",
 ]  # fmt: skip
 
 SAMPLED = "the current at single ticks"
 BEFORE = "the mean of the ten ticks before the row"
+LOGGED_CURRENT = "logged current"  # a column: mA, as logged, where the mean was worked out from it
 
 
 def servo_law(
@@ -49,6 +50,7 @@ def servo_law(
     c: dict[str, Array],
     cal: Calibration,
     smooth: Smooth,
+    digits: Mapping[str, float],
     draws: int = CURRENT_DRAWS,
     samples: int = 1,
     behind: LowPass = AS_LOGGED,
@@ -58,6 +60,7 @@ def servo_law(
     At the row it has the logged stroke with its noise; the nine ticks before it had other noise, so theirs is taken off
     the stroke.
 
+    digits  steps of the last digits of ``x_lvdt`` and ``x_dem`` (mm)
     behind  the low-pass that stroke and current have passed and the demand has not. The law is linear: with the demand
             behind the same low-pass it holds for what was logged
 
@@ -75,7 +78,8 @@ def servo_law(
     law = law_of(x_dem, smooth.stroke, cal, x, behind)
     # not known: the LVDT's noise in nine ticks, what smoothing leaves at the rows, the way between them, which is known
     # as well as a straight line and a cubic agree, and what the last digits of logged demand and stroke hide
-    draw, of_stroke, of_demand = np.random.default_rng(0), last_digit(x), last_digit(x_dem)
+    draw = np.random.default_rng(0)
+    of_stroke, of_demand = (last_digit(v, digits.get(name, 0.0)) for v, name in ((x, "x_lvdt"), (x_dem, "x_dem")))
     of_mean, of_some = np.empty((len(t), draws)), np.empty((len(t), draws))
     off, ticks = stroke, np.empty(when.shape)
     for k in range(draws):
@@ -189,6 +193,16 @@ def samples_of(ticks: Array, samples: int) -> Array:
     return np.asarray(ticks[:, np.ceil(10.0 / samples * np.arange(1, samples + 1)).astype(int) - 1].mean(axis=1))
 
 
+def taken(ticks: Array, samples: int) -> dict[str, Array]:
+    """What each way of a logger takes of the ticks since the row before, float64[rows, 10]: their mean, first, and
+    others by their names.
+    """
+    mean = ticks.mean(axis=1)
+    return {
+        "": mean, SAMPLED: samples_of(ticks, samples), BEFORE: mean + 0.1 * (np.roll(ticks[:, -1], 1) - ticks[:, -1])
+    }  # fmt: skip
+
+
 def other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Calibration, samples: int) -> str:
     """Where the log's current is not the mean of the ticks since the row before, the one at the row included, put that
     in its place.
@@ -208,12 +222,12 @@ def other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Ca
         mean, square = (np.bincount(window, x)[most] / count[most] for x in (e, e * e))
         return float(np.median(np.sqrt(np.maximum(square - mean**2, 0.0)))) if most.any() else 0.0
 
-    mean = law.mean(axis=1)
-    others = {SAMPLED: samples_of(law, samples), BEFORE: mean + 0.1 * (np.roll(law[:, -1], 1) - law[:, -1])}
-    what = min(others, key=lambda k: misfit(others[k]))
-    if misfit(others[what]) >= OTHER_CURRENT * misfit(mean):
+    ways = taken(law, samples)
+    what = min((SAMPLED, BEFORE), key=lambda k: misfit(ways[k]))
+    if misfit(ways[what]) >= OTHER_CURRENT * misfit(ways[""]):
         return ""
-    c["i_cmd"] = c["i_cmd"] + (mean - others[what])
+    c[LOGGED_CURRENT] = c["i_cmd"]
+    c["i_cmd"] = c["i_cmd"] + (ways[""] - ways[what])
     return what
 
 

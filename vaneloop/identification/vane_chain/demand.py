@@ -10,7 +10,7 @@ from controller import Calibration, new_inputs, new_outputs, new_state
 from controller.records import SLOW, SLOW_TICK, TICK, Record, as_inputs, as_outputs, as_scalars, as_state
 from controller.schedule import ROW_EXTENSION, ROW_RETRACTION, move_demand, schedule_step
 from controller.trend import trend_step
-from hil.figures import noise_floor, resolution
+from hil.figures import noise_floor
 from hil.native.call import firmware
 from plant.curve import DEMAND_ADDS
 from plant.effects import ROW
@@ -168,7 +168,7 @@ def demand_stage(driven: Driven) -> Stage:
         return stage
     neutral = stage.neutral()[None]
     as_logged, draws = simulate(neutral)[0, 0], []
-    of_demand, of_speed = last_digit(n_dem), _other_noise(t, n_r)
+    of_demand, of_speed = last_digit(n_dem, driven.digit("n_dem")), _other_noise(t, n_r, driven.digit("n_r"))
     for k in range(CURRENT_DRAWS):
         came, read = (of(np.random.default_rng(s)) for of, s in ((of_demand, k), (of_speed, CURRENT_DRAWS + k)))
         other = {"n_dem": n_dem + came, "n_r": n_r + read}
@@ -180,10 +180,12 @@ def demand_stage(driven: Driven) -> Stage:
     return stage
 
 
-def _other_noise(t: Array, values: Array) -> Callable[[np.random.Generator], Array]:
-    """Function that draws noise such as a measured channel has: the rounding of its last digit, and white."""
-    digit, size = last_digit(values), noise_floor(t, values)
-    white = max(size**2 - (resolution(values) / 12.0**0.5) ** 2, 0.0)
+def _other_noise(t: Array, values: Array, step: float) -> Callable[[np.random.Generator], Array]:
+    """Function that draws noise such as a measured channel has: the rounding of its last digit, a ``step``, and
+    white.
+    """
+    digit, size = last_digit(values, step), noise_floor(t, values)
+    white = max(size**2 - (step / 12.0**0.5) ** 2, 0.0)
     white = np.sqrt(white if white > 0.05 * size**2 else 0.0)
     return lambda draw: digit(draw) + white * draw.standard_normal(len(t))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from hil.figures import resolution
 from plant import chain, places
 from plant.stages import engine_run
 from vaneloop.identification.onset import that_begins
@@ -56,9 +55,9 @@ def engine_stage(driven: Driven) -> Stage:
     measured = driven.measured(run)
     stage = Stage("engine", outputs, ("%",), parameters, effects, simulate, t, measured)
     stage.made = Made(engine_stage, driven)
-    if resolution(c["n_dem"]) and not driven.again:
+    if driven.digit("n_dem") and not driven.again:
         neutral = stage.neutral()[None]
-        digit = last_digit(c["n_dem"])
+        digit = last_digit(c["n_dem"], driven.digit("n_dem"))
         drawn = (digit(np.random.default_rng(k)) for k in range(NOISE_DRAWS))
         draws = [simulate(neutral, logged + between_rows(d))[0] for d in drawn]
         expect_draws(stage, np.array(draws) - simulate(neutral)[0])

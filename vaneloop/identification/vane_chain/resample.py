@@ -19,7 +19,7 @@ from vaneloop.base.compiled import compiled
 from vaneloop.base.sizes import no_smaller
 from vaneloop.base.vanes import VANES
 from vaneloop.identification.regimes import steady
-from vaneloop.identification.settings import CONDITION_BAND, RASTER, WINDOW
+from vaneloop.identification.settings import CONDITION_BAND, EXPLAINED, RASTER, WINDOW
 from vaneloop.identification.subsystem import Array, Stage
 
 __all__ = [
@@ -47,6 +47,7 @@ __all__ = [
 
 CONDITIONS = ("x_lvdt", "n_r", "t_oil", "p_s", "i_cmd")
 DEMANDS = ("n_dem", "x_dem")  # no sensor reads them
+ROUNDED = (*DEMANDS, "n_r", "x_lvdt")  # drive a subsystem: what their last digit hides is an error of what they drive
 
 
 class OfSubsystem(NamedTuple):
@@ -79,6 +80,8 @@ class Grid(NamedTuple):
     steps            usual time between two samples of each channel, s
     known            first row that each channel, or subsystem, has, and the row behind its last; those that have all
                      may be left out
+    digits           step of the last digit of each of `ROUNDED` as filed: what is worked out of it, such as rows
+                     between samples, has been rounded as well
     """
 
     start: float
@@ -86,6 +89,7 @@ class Grid(NamedTuple):
     rows: int
     steps: Mapping[str, float]
     known: Mapping[str, tuple[int, int]] = MappingProxyType({})
+    digits: Mapping[str, float] = MappingProxyType({})
 
     def rows_of(self, name: str) -> tuple[int, int]:
         """First row of a channel or a subsystem, and the row behind its last."""
@@ -138,7 +142,8 @@ def grid_of(log: Log) -> Grid:
         return min(begin, rows), max(min(int((high - start) / dt + 1e-6) + 1, rows), 0) if early else rows
 
     of_each = {name: known(*s) for name, s in (many | spans).items()}
-    return Grid(start, dt, rows, steps, {name: s for name, s in of_each.items() if s != (0, rows)})
+    digits = {name: resolution(channels[name].values) for name in ROUNDED if name in channels}
+    return Grid(start, dt, rows, steps, {name: s for name, s in of_each.items() if s != (0, rows)}, digits)
 
 
 class Gaps(NamedTuple):
@@ -255,7 +260,7 @@ def _columns(
             i = np.clip(np.searchsorted(c.t, when + 0.5 * step) - 1, 0, len(c.t) - 1)
             columns[name] = c.values[i]
         else:
-            columns[name] = np.interp(when, c.t, c.values)
+            columns[name] = np.interp(when + (_settled(c, when, step, dt) if uniform else 0.0), c.t, c.values)
         i = np.clip(np.searchsorted(c.t, when), 1, len(c.t) - 1)
         away = np.minimum(np.abs(c.t[i] - when), np.abs(when - c.t[i - 1]))
         if name in grid.known:  # a gap is between samples; before the first and after the last there is none
@@ -283,6 +288,25 @@ def _held(c: Channel, step: float, dt: float) -> bool:
     return bool(step < 0.6 * dt and np.count_nonzero(np.diff(c.values)) < 0.3 * len(c.t))
 
 
+def _settled(c: Channel, when: Array, step: float, dt: float) -> float:
+    """Seconds behind the rows ``when`` at which a channel shows what it had there, where it comes in frames and a
+    low-pass, or a mean, makes slopes of their steps: on a slope a row is partly the frame before, and its noise, too.
+    """
+    many = round(dt / step)
+    if many < 3 or len(when) < 2:
+        return 0.0
+    place = np.rint((c.t[1:] - when[0]) / step).astype(int) % many  # of the sample that a change ends at
+    usual = np.diff(c.t) < 1.5 * step
+    change = np.bincount(place[usual], np.diff(c.values)[usual] ** 2, many) / np.maximum(
+        np.bincount(place[usual], minlength=many), 1
+    )
+    moves = change >= EXPLAINED * change.mean()
+    if moves.all():
+        return 0.0
+    settles = int(np.argmin(moves))  # after the row; and there it stays until the next frame
+    return (settles + int(np.argmax(moves[settles:])) - 1 if moves[settles:].any() else many - 1) * step
+
+
 def _to_frame(channels: Mapping[str, Channel], steps: Mapping[str, float], start: float, dt: float) -> float:
     """Return the time from ``start`` to the controller's next frame, as the commands in a log faster than the frames
     show it; else 0.
@@ -307,9 +331,11 @@ def every_other(columns: dict[str, Array], current: Array | None = None) -> dict
     return out
 
 
-def last_digit(values: Array) -> Callable[[np.random.Generator], Array]:
-    """Function that draws the rounding error of a channel's last digit, which changes where the reading does."""
-    step, reading = resolution(values), np.cumsum(np.diff(values, prepend=values[:1]) != 0.0)
+def last_digit(values: Array, step: float) -> Callable[[np.random.Generator], Array]:
+    """Function that draws the rounding error of a channel's last digit, a ``step``, which changes where the reading
+    does.
+    """
+    reading = np.cumsum(np.diff(values, prepend=values[:1]) != 0.0)
     return lambda draw: np.asarray(step * draw.uniform(-0.5, 0.5, reading[-1] + 1)[reading])
 
 

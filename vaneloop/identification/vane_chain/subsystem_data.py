@@ -54,6 +54,8 @@ class Driven(NamedTuple):
     again                whether the stage takes its noise over, as one does that was made of this log before: it is not
                          estimated
     side                 of two actuators, the one that the stage is about (0 A, 1 B); None: both, or the only one
+    digits               step of the last digit of channels as filed (`resample.Grid`), border units
+    samples              of the current, that the log has for each row
     """
 
     t: Array
@@ -71,6 +73,12 @@ class Driven(NamedTuple):
     part_of: tuple[Driven, Array | slice] | None = None
     again: bool = False
     side: int | None = None
+    digits: Mapping[str, float] = MappingProxyType({})
+    samples: int = 1
+
+    def digit(self, name: str) -> float:
+        """Step of a channel's last digit; 0: it has none."""
+        return self.digits.get(name, 0.0)
 
     def name(self, stage: str) -> str:
         """What a stage is called: that of one of two actuators with its side, ``actuator_b``."""
