@@ -137,14 +137,14 @@ def kernel_alone(plants: list[Plant], seconds: float) -> float:
     """Simulated s/s of the kernel, with noise, without the building of the engines."""
     k, cal, stimulus = kernel(), load_calibration(), demand(seconds)
     n, ticks = len(plants), round(seconds * 1000)
-    arrays = put_on_gpu(k, plants, [cal] * n, [stimulus] * n, 1)
+    arrays = put_on_gpu(k, plants, [cal] * n, [stimulus] * n, 1, 10, ticks - 10)
     numbers = np.random.default_rng(1).standard_normal((CHUNK, 2 + len(plants[0].vanes)))
     noise = k.cuda.to_device(numbers)
-    k(n, -WARM_UP, WARM_UP, 10, ticks - 10, noise, *arrays)
+    k(-WARM_UP, WARM_UP, noise, *arrays)
     k.cuda.synchronize()
     started = time.perf_counter()
     for k0 in range(0, ticks, CHUNK):
-        k(n, k0, min(CHUNK, ticks - k0), 10, ticks - 10, noise, *arrays)
+        k(k0, min(CHUNK, ticks - k0), noise, *arrays)
     k.cuda.synchronize()
     return n * seconds / (time.perf_counter() - started)
 

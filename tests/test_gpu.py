@@ -7,13 +7,20 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from controller import load_calibration
+from hil import inject
+from hil.inject import Scenario
+from hil.inject.heard import Heard, hear
+from hil.inject.in_lanes import WATCHED, margins_in_lanes, margins_on_gpu
+from hil.inject.margin import Margin, margins
 from hil.loop import cuda, engines
 from hil.loop.engines import Engines, Unfinished, lockstep_engines
+from hil.loop.heard_lanes import H_FRESH, H_P_S, H_SOURCE, N_HEARD, depth, stretches
 from hil.loop.lockstep import Stimulus, lockstep
 from plant import Model, Plant, build_plant
 from vaneloop.base import extras
@@ -100,16 +107,21 @@ def simulated() -> None:
         print(json.dumps(figures(lockstep_engines(RISE, plants(), calibrations=given, seed=1, device="cuda"))))
 
 
-@pytest.mark.slow
-def test_the_kernel_gives_what_the_loop_gives():
+def in_simulator(function: str) -> list[Any]:
+    """What a function of this file prints in a process in which numba's simulator stands in for a GPU."""
     if not extras.is_there("numba_cuda"):
         pytest.skip("the extra gpu is not installed: the kernel has no simulator to run in")
-    code = "from tests.test_gpu import simulated; simulated()"
+    code = f"from tests.test_gpu import {function}; {function}()"
     env = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1"}
     done = subprocess.run([sys.executable, "-c", code], cwd=HERE, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    for line, strategies in zip(done.stdout.splitlines(), (("dual", "dual"), ("dual", "single")), strict=True):
-        told = json.loads(line)
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+@pytest.mark.slow
+def test_the_kernel_gives_what_the_loop_gives():
+    told_all = in_simulator("simulated")
+    for told, strategies in zip(told_all, (("dual", "dual"), ("dual", "single")), strict=True):
         for i, (plant, strategy) in enumerate(zip(plants(), strategies, strict=True)):
             log = lockstep(RISE, calibration=load_calibration(strategy=strategy), plant=plant, seed=1).columns
             assert told["stroke"][i] == log["x_lvdt"][-1]
@@ -119,3 +131,97 @@ def test_the_kernel_gives_what_the_loop_gives():
                 assert told["angles"][i][q] == pytest.approx(log[vane][-1], rel=1e-9)
                 assert told["angle_error"][i][q] == pytest.approx(np.abs(log[vane] - targets[:, q]).max(), rel=1e-9)
             assert told["in_mode"][i] == pytest.approx(0.01 * np.bincount(log["state"].astype(int), minlength=5))
+
+
+# ---- scenarios -------------------------------------------------------------------------------------------------------
+
+# frames late, refused, twice and with other bits; oil, sensor and tables that change, one of them within 10 ms, two at
+# once; claims of every kind
+ACTIONS = [
+    {"action": "delay", "delay": 0.01, "jitter": 0.03, "start": 0.05, "duration": 0.1},
+    {"action": "override", "signals": {"n_r": 71.5}, "every": 2, "start": 0.1},
+    {"action": "corrupt", "bits": 1, "probability": 0.2},
+    {"action": "replay", "frame": "ECU_DEMAND", "begin": 0.05, "length": 0.05, "start": 0.2, "duration": 0.05},
+    {"action": "machine", "p_s": 0.0, "start": 0.123, "duration": 0.02},
+    {"action": "machine", "effect": "lvdt_bias", "parameters": {"bias": 1.5}, "start": 0.153, "duration": 0.047},
+    {"action": "machine", "effect": "schedule_error", "parameters": {"offset": 1.0}, "start": 0.2},
+    {"action": "machine", "effect": "aero_load", "parameters": {"force": 2000.0}, "start": 0.0},
+]
+CLAIMS = [
+    {"mode": "RUN", "at": 0.05, "tolerance": 0.1},
+    {"mode": "RUN", "during": [0.2, 0.29]},
+    {"mode": "DEGRADED", "never": True},
+    {"fault": "any", "never": True, "during": [0.1, 0.2]},
+    {"fault": "demand_rejected", "by": 0.2},
+    {"signal": "vigv", "low": -20.0, "high": 30.0, "during": [0.2, 0.25]},
+    {"signal": "vgv2", "low": 5.0, "by": 0.3, "after": 0.1},
+    {"signal": "x_lvdt", "low": 2.0, "high": 12.0, "never": False, "during": [0.1, 0.3]},
+    {"signal": "n_r", "low": 61.0, "high": 80.0, "by": 0.2},
+    {"signal": "i_cmd", "low": -30.0, "high": 30.0, "during": [0.05, 0.2]},
+    {"count": "good", "low": 3, "by": 0.2},
+]
+DAY = Scenario.model_validate({
+    "title": "Some of everything", "duration": 0.3, "seed": 3, "demand": [[0.0, 60.0], [0.1, 60.0], [0.3, 70.0]],
+    "inject": ACTIONS, "expect": CLAIMS,
+})  # fmt: skip
+
+
+def heard(scenario: Scenario) -> Heard:
+    """What a controller hears of a scenario."""
+    found = hear(scenario, build_plant())
+    assert isinstance(found, Heard)
+    return found
+
+
+def on_gpu(scenario: Scenario, given: list[Plant]) -> list[list[Margin]]:
+    """Margins of machines that ran on the GPU."""
+    found = margins_on_gpu(cuda.kernel(WATCHED), scenario, given, load_calibration(), heard(scenario))
+    return [one for some, of in found for _, one in zip(some, of, strict=True)]
+
+
+def assert_same(one: list[Margin], other: list[Margin]) -> None:
+    """The same verdicts, and margins within 1e-9 of their value."""
+    assert [(m.expected, m.held, m.unit) for m in one] == [(m.expected, m.held, m.unit) for m in other]
+    of = [np.array([(m.value, m.share) for m in some]) for some in (one, other)]
+    np.testing.assert_allclose(*of, rtol=1e-9, atol=1e-12)
+
+
+def simulated_day() -> None:
+    """In a child: margins of a scenario, from the kernel that numba's simulator interprets."""
+    for one in on_gpu(DAY, plants()):
+        print(json.dumps([[m.expected, m.held, m.value, m.unit, m.share] for m in one]))
+
+
+@pytest.mark.slow
+def test_a_scenario_in_the_kernel_is_that_in_lanes_and_on_the_bus():
+    lanes = margins_in_lanes(DAY, plants(), load_calibration(), heard(DAY))
+    held = set()
+    for plant, mine, told in zip(plants(), lanes, in_simulator("simulated_day"), strict=True):
+        found = [Margin(*row) for row in told]
+        assert_same(found, mine)
+        assert_same(found, margins(DAY, inject.run(DAY, plant=plant)))
+        held |= {m.held for m in found}
+    assert held == {True, False}
+
+
+def test_a_stretch_ends_where_something_new_is_heard():
+    rows = np.zeros((25, N_HEARD))
+    rows[:, H_SOURCE] = -1.0
+    rows[3, H_FRESH], rows[3, H_SOURCE] = 1.0, 0.0
+    rows[17:, H_P_S] = 1e6
+    assert stretches(rows).tolist() == [3, 2, 1, *range(7, 0, -1), *range(7, 0, -1), 3, 2, 1, *range(5, 0, -1)]
+    assert depth(rows) == 1
+    rows[23, H_FRESH], rows[23, H_SOURCE] = 1.0, 0.0
+    assert depth(rows) == 3, "the third frame of the ECU has been sent when the first one comes"
+
+
+@pytest.mark.slow
+def test_ten_thousand_engines_on_a_gpu_are_those_in_lanes():
+    try:
+        cuda.check()
+    except cuda.unusable() as e:
+        pytest.skip(f"no GPU: {cuda.said(e)}")
+    given = (plants() * 5_000)[:10_000]
+    some = [Model(effects={"lvdt_bias": {"bias": 1e-4 * i}}).plant(plant) for i, plant in enumerate(given)]
+    for one, other in zip(on_gpu(DAY, some), margins_in_lanes(DAY, some, load_calibration(), heard(DAY)), strict=True):
+        assert_same(one, other)

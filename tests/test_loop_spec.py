@@ -809,12 +809,12 @@ class Kernel:
 
     def __init__(self) -> None:
         self.calls: list[Any] = []
-        self.arrays: list[Any] = []
 
-    def __call__(self, n: int, k0: int, ticks: int, every: int, last: int, noise: Any, *arrays: Any) -> None:
-        self.calls.append((n, k0, ticks, every, last, noise.shape))
-        self.arrays, self.noise = list(arrays), noise
-        found = arrays[-1]
+    def __call__(self, k0: int, ticks: int, noise: Any, machines: Any, hears: Any, notes: Any) -> None:
+        n = machines.s.shape[1]
+        self.calls.append((n, k0, ticks, notes.every, notes.last, noise.shape))
+        self.machines, self.hears, self.notes, self.noise = machines, hears, notes, noise
+        found = notes.found
         found[:] = np.arange(len(found))[:, None] + 0.25 * np.arange(n)
         found[engines.gpu.LAST_MODE], found[engines.gpu.LOST] = 2.0, np.arange(n) % 2
 
@@ -854,7 +854,8 @@ def test_engines_on_a_gpu_begin_at_rest_and_their_figures_come_back_in_the_borde
         again = np.random.Generator(np.random.PCG64(seed))
         again.standard_normal((10_000, 2 + stages))
         np.testing.assert_array_equal(kernel.noise, again.standard_normal((5000, 2 + stages)))
-    rows, which, sigma, own, scalars, tables, angles, schedule, s, p, z, found = kernel.arrays
+    sigma, own, scalars, tables, angles, s, p, z = kernel.machines
+    (rows, which), schedule, found = kernel.hears, kernel.notes.targets, kernel.notes.found
     assert which.tolist() == [0, 1, 2] and own.tolist() == [0, 0, 1] and rows.shape == (3, 1500, rows.shape[2])
     assert sigma.any() == (seed is not None) and sigma.shape == (2 + stages, 3) and len(tables) == len(angles) == 2
     np.testing.assert_array_equal(p[:, 0], PLANT.p[: engines.gpu.P_ROWS, 0])
@@ -873,9 +874,8 @@ def test_engines_on_a_gpu_begin_at_rest_and_their_figures_come_back_in_the_borde
     assert out.devices == ["stand-in"] and out.on.tolist() == [0, 0, 0]
     assert found.shape == (gpu.FOUND, 3) and not isinstance(scalars, gpu.Scalars)
     alone: Any = Kernel()
-    engines.put_on_gpu(alone, [PLANT], [CAL], stimuli[:1], seed)
-    one = engines.put_on_gpu(alone, [PLANT, PLANT], [CAL, CAL], stimuli[:2], seed)
-    assert isinstance(one[4], gpu.Scalars) and one[4].kp == CAL.scalars.kp  # one calibration is no array
+    one, _, _ = engines.put_on_gpu(alone, [PLANT, PLANT], [CAL, CAL], stimuli[:2], seed, 10, 20)
+    assert isinstance(one.scalars, gpu.Scalars) and one.scalars.kp == CAL.scalars.kp  # one calibration is no array
 
 
 def flashed_plant() -> Any:

@@ -84,7 +84,7 @@ LATE: dict[str, dict[str, str]] = {
     "hil/logs/dbc.py": {"cantools": "start-up: 120 ms"},
     "hil/logs/guess.py": {"controller": "start-up: 300 ms", "plant.geometry": "start-up: 300 ms"},
     "hil/logs/units.py": {"pint": "start-up: 270 ms"},
-    "hil/loop/cuda.py": {"numba.cuda": "extra gpu"},
+    "hil/loop/cuda.py": {"numba.cuda": "extra gpu", "numba.cuda.libdevice": "extra gpu"},
     "hil/replay/__main__.py": {"vaneloop.cli.replay": "start-up: 900 ms, in which Ctrl-C is heard"},
     "vaneloop/base/terminal.py": {
         "rich": "start-up: 60 ms",

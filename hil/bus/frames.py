@@ -31,9 +31,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ANGLES", "AUTH", "AUTH_NAMES", "COUNTS", "ECU_DEMAND", "ERROR", "EXTENDED", "FD", "FRAMES", "FRESHNESS", "NAMES",
-    "PAUSE", "PREPARED", "REMOTE", "SEEDS", "UNAUTHENTIC", "VGV_ANGLES", "VGV_ANGLES_2", "VGV_ANGLES_3", "VGV_HEALTH",
-    "VGV_SERVO", "VGV_STATUS", "decode", "decode_auth", "encode_auth", "from_bytes", "from_message", "new_receiver",
-    "passes", "receive", "refused", "stand_still", "to_bytes", "to_message", "with_demand", "word0",
+    "PAUSE", "PREPARED", "REMOTE", "SEEDS", "SPEED_STEP", "UNAUTHENTIC", "VGV_ANGLES", "VGV_ANGLES_2", "VGV_ANGLES_3",
+    "VGV_HEALTH", "VGV_SERVO", "VGV_STATUS", "decode", "decode_auth", "encode_auth", "from_bytes", "from_message",
+    "new_receiver", "passes", "raw_speed", "receive", "refused", "speed_of", "stand_still", "to_bytes", "to_message",
+    "with_demand", "word0",
 ]  # fmt: skip
 
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29
@@ -43,6 +44,7 @@ NOTE = 1 << 56  # no frame: the loop's own word to its node. No bus gives it: it
 UNAUTHENTIC = 1 << 57  # a frame that its MAC does not prove (`hil.bus.secoc`); no bus gives it either
 IDENT_MASK = (1 << 29) - 1
 LENGTH = 8  # bytes of data of every frame here
+SPEED_STEP = 0.002  # %, of a speed in ECU_DEMAND
 CLASSIC = LENGTH << 32  # word 0 without its identifier
 
 NAMES = {
@@ -135,17 +137,29 @@ def _at(raw: int, at: int) -> int:
 
 
 @in_place
+def raw_speed(speed: float) -> int:
+    """Return the 16 bits that ECU_DEMAND has for a speed (%)."""
+    return _raw(speed, SPEED_STEP, 0.0, 0.0, 125.0, 65535) & 0xFFFF
+
+
+@in_place
+def speed_of(raw: int) -> float:
+    """Return the speed (%) of 16 bits of ECU_DEMAND."""
+    return raw * SPEED_STEP
+
+
+@in_place
 def encode_demand(n_dem: float, n_r: float, mode_request: int, counter: int) -> int:
     """Return word 1 of ECU_DEMAND: speeds in %, ``mode_request`` 0 or 1."""
     data = (mode_request & 3) << 12
-    data |= _at(_raw(n_dem, 0.002, 0.0, 0.0, 125.0, 65535), 16) | _at(_raw(n_r, 0.002, 0.0, 0.0, 125.0, 65535), 32)
+    data |= _at(raw_speed(n_dem), 16) | _at(raw_speed(n_r), 32)
     return protect(ECU_DEMAND, data, counter)
 
 
 @in_place
 def decode_demand(data: int) -> tuple[float, float, int]:
     """Return n_dem (%), n_r (%) and mode_request of word 1 of ECU_DEMAND."""
-    return u16(data, 16) * 0.002, u16(data, 32) * 0.002, (data >> 12) & 3
+    return speed_of(u16(data, 16)), speed_of(u16(data, 32)), (data >> 12) & 3
 
 
 @in_place

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from controller.records import INPUTS, SLOW
+from hil.bus.frames import SPEED_STEP
 from hil.inject.actions import BusOff, ErrorFrames, Outsider, Replay, Send
 from hil.inject.on_lockstep import OnLockstep, demand_at
 from hil.inject.scenario import COUNTS, Scenario
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Heard", "hear"]
 
-STEP = 0.002  # %, of a speed in ECU_DEMAND
 MOST = 62_500  # greatest mark: 125 %
 N_DEM, N_R, REQUEST, FRESH, REJECTED = map(
     INPUTS.index, ("n_dem", "n_r", "mode_request", "demand_fresh", "demand_rejected")
@@ -72,14 +72,14 @@ class _Played:
         self.supply = np.empty((ticks, 2))
         self.heard = loop.heard
         for k in range(ticks):
-            loop.tick(STEP * _mark(k // SLOW, times))
+            loop.tick(SPEED_STEP * _mark(k // SLOW, times))
             self.inputs[k], self.supply[k] = loop.node.loop.inputs, loop.node.arrays.supply[:2]
             self.counts[k] = loop.counts()
             self.late[k] = [n in loop.missed for n in loop.heard]
 
     def speeds(self) -> np.ndarray:
         """The speeds that came, as the frames have them: int64."""
-        return np.rint(self.inputs[:, N_R] / STEP).astype(np.int64)
+        return np.rint(self.inputs[:, N_R] / SPEED_STEP).astype(np.int64)
 
     def same(self, other: _Played) -> bool:
         """Whether all but the speeds is the same."""

@@ -51,18 +51,25 @@ from vaneloop.base.vanes import MOST
 __all__ = [
     "ANGLE_ERROR",
     "ANGLE_LAST",
+    "FIGURES",
     "FOUND",
     "LAST_MODE",
     "LAST_STROKE",
     "LOST",
     "NUMBERS",
     "P_ROWS",
+    "ROWS",
     "SAMPLES",
     "SERVO",
     "S_ROWS",
     "Z_ROWS",
+    "Figures",
+    "Frames",
     "Kernel",
+    "Machines",
     "Scalars",
+    "Watched",
+    "check",
     "kernel",
     "said",
     "unusable",
@@ -77,7 +84,8 @@ ANGLE_LAST = ANGLE_ERROR + MOST
 FOUND = ANGLE_LAST + MOST
 # rows of the firmware's state that the strategies of curves have; of the plant's state and parameters, without curves
 Z_ROWS, S_ROWS, P_ROWS = STATE.index("speed"), curve.S_CURRENT + 1, CURVES + 1
-NUMBERS = Z_ROWS + S_ROWS + P_ROWS + FOUND + 1  # of an engine, beside the noise of its sensors
+ROWS = Z_ROWS + S_ROWS + P_ROWS
+NUMBERS = ROWS + FOUND + 1  # of an engine, beside the noise of its sensors
 THREADS = 256  # of a block: all that the registers of a multiprocessor of an H100 or H200 allow
 NOTHING_TO_COMPILE = "NVIDIA's compiler is missing: pip install 'numba-cuda[cu13]'"
 
@@ -87,7 +95,6 @@ _Inputs, _State, _number = kind(INPUT_FIELDS), kind(STATE_FIELDS), numba.float64
 
 _named: Any = namedtuple  # mypy wants its names spelled out
 Scalars: Any = _named("Scalars", [f.name for f in SCALAR_FIELDS])
-SCALARS_AT = 9  # of the arguments
 
 
 class _Calibration(NamedTuple):
@@ -143,21 +150,134 @@ def _zero(s: Any, p: Any, j: int, site: int) -> float:
     return 0.0
 
 
-def _run(
-    k0: int, ticks: int, every: int, last: int, noise: Any, stimuli: Any, which: Any, sigma: Any, own: Any,
-    scalars: Any, tables: Any, angles: Any, targets: Any, s: Any, p: Any, z: Any, found: Any,
-) -> None:  # fmt: skip
-    """Advance each engine by ``ticks`` ticks from tick ``k0``, a multiple of 10: the loop of `hil.loop.lockstep`.
+def _nearest(libdevice: Any) -> Any:
+    """Function that rounds to the nearest whole number, halves to the even one."""
 
-    every     ticks between two samples that count, from tick 0 on; ``last``: tick of the last one
-    noise     float64[ticks or 1, 2 + stages] standard normal numbers, the same for every engine
-    stimuli, which  float64[:, frames, N_STIMULUS], and which of them each engine has
+    def nearest(v: float) -> float:
+        return libdevice.rint(v)
+
+    return nearest
+
+
+class Watched(NamedTuple):
+    """What a loop on a GPU hears and what is noted of it: functions with ``hears`` or ``notes`` before all else, which
+    are tuples of arrays on the GPU.
+
+    stretch  (hears, k) -> ticks from tick k on, 10 at most, in which nothing new is heard
+    hear     (hears, k, j, inputs, k_of, n_r, sigma, noise) -> n_dem (%), n_r (%) at which the machine runs, p_s (Pa),
+             t_oil (degC), at the beginning of such a stretch; puts what comes into the firmware's inputs.
+             ``n_r``: %, of the engine; ``sigma``, ``noise``: of its measurement
+    tick     (notes, k, j, state, inputs): notes what the firmware did at tick k
+    before, after  (notes, k, j, s, sigma, noise, m, n_r): note where the vanes are before tick k moves them, and after
+    """
+
+    stretch: Any
+    hear: Any
+    tick: Any
+    before: Any = _nothing
+    after: Any = _nothing
+
+
+class Machines(NamedTuple):
+    """Engines as arrays on the GPU.
+
     sigma     float64[2 + stages, engine], of the sensors
     own       which calibration each engine has: ``scalars`` (records, or `Scalars` of the only one),
               float64[:, 4, points] ``tables``, float64[:, 1 + stages, points] ``angles``
-    targets   float64[1 + stages, points] speed (%) and each stage's target (rad) at it
     s, p, z   rows of the plant's state and parameters and of the firmware's state, float64[row, engine]
-    found     float64[FOUND, engine]
+    """
+
+    sigma: Any
+    own: Any
+    scalars: Any
+    tables: Any
+    angles: Any
+    s: Any
+    p: Any
+    z: Any
+
+
+class Frames(NamedTuple):
+    """What engines hear of a `hil.loop.lockstep.Stimulus`.
+
+    stimuli, which  float64[:, frames, N_STIMULUS], and which of them each engine has
+    """
+
+    stimuli: Any
+    which: Any
+
+
+class Figures(NamedTuple):
+    """What is noted of engines whose figures are asked for.
+
+    every    ticks between two samples that count, from tick 0 on; ``last``: tick of the last one
+    targets  float64[1 + stages, points] speed (%) and each stage's target (rad) at it
+    found    float64[FOUND, engine]
+    """
+
+    every: int
+    last: int
+    targets: Any
+    found: Any
+
+
+def _whole_frame(hears: Frames, k: int) -> int:
+    return SLOW
+
+
+def _hear_frame(
+    hears: Frames, k: int, j: int, inputs: Any, k_of: Any, n_r: float, sigma: float, noise: float
+) -> tuple[float, float, float, float]:
+    rows = hears.stimuli[hears.which[j]]
+    frame = min(max(k // SLOW, 0), rows.shape[0] - 1)
+    n_dem, heard = rows[frame, S_N_DEM], rows[frame, S_N_R]
+    if heard != heard:
+        heard = n_r + sigma * noise
+    inputs.n_dem, inputs.n_r, inputs.mode_request = n_dem, heard, rows[frame, S_MODE_REQUEST]
+    inputs.demand_fresh, inputs.demand_rejected = rows[frame, S_FRESH], rows[frame, S_REJECTED]
+    return n_dem, heard, rows[frame, S_P_S], rows[frame, S_T_OIL]
+
+
+def _figures_of_tick(notes: Figures, k: int, j: int, state: Any, inputs: Any) -> None:
+    if k < 0 or k % notes.every != 0:
+        return
+    found = notes.found
+    error = abs(state.x_dem - inputs.x_lvdt)
+    found[SERVO, j] = max(found[SERVO, j], error)
+    found[SAMPLES + int(state.mode), j] += 1.0
+    if not error < np.inf:
+        found[LOST, j] += 1.0
+    if k == notes.last:
+        found[LAST_MODE, j], found[LAST_STROKE, j] = state.mode, inputs.x_lvdt
+
+
+def _figures_of_vanes(notes: Figures, k: int, j: int, s: Any, sigma: Any, noise: Any, m: int, n_r: float) -> None:
+    if k < 0 or k % notes.every != 0:
+        return
+    found = notes.found
+    for q in range(notes.targets.shape[0] - 1):
+        angle = s[POT + q, j] + sigma[1 + q, j] * noise[m, 1 + q]
+        error = abs(angle - look_up(0, 1 + q, notes.targets, n_r))
+        found[ANGLE_ERROR + q, j] = max(found[ANGLE_ERROR + q, j], error)
+        if not error < np.inf:
+            found[LOST, j] += 1.0
+        if k == notes.last:
+            found[ANGLE_LAST + q, j] = angle
+
+
+FIGURES = Watched(_whole_frame, _hear_frame, _figures_of_tick, before=_figures_of_vanes)
+_stretch, _hear, _tick, _before, _after = FIGURES  # in the kernel's own copy of these names those of a `Watched`
+
+
+def _run(
+    k0: int, ticks: int, noise: Any, sigma: Any, own: Any, scalars: Any, tables: Any, angles: Any, s: Any, p: Any,
+    z: Any, hears: Any, notes: Any,
+) -> None:  # fmt: skip
+    """Advance each engine by ``ticks`` ticks from tick ``k0``: the loop of `hil.loop.lockstep` and `hil.loop.node`.
+
+    noise   float64[ticks or 1, 2 + stages] standard normal numbers, the same for every engine
+    sigma to z  as of `Machines`
+    hears, notes  as of `Watched`
     """
     j = cuda.grid(1)
     if j >= s.shape[1]:
@@ -168,51 +288,34 @@ def _run(
     _take(z, j, state)
     c = own[j]
     cal: Any = _Calibration(_own(scalars, c), tables[c], angles[c])
-    rows, stages = stimuli[which[j]], targets.shape[0] - 1
-    last_frame, noisy = rows.shape[0] - 1, noise.shape[0] > 1
+    noisy, speed = noise.shape[0] > 1, sigma.shape[0] - 1
     sigma_lvdt = sigma[0, j]
     inputs.pause = 0.0
-    for first in range(0, ticks, SLOW):
+    first = 0
+    while first < ticks:
         k = k0 + first
-        many = min(SLOW, ticks - first)
-        frame = min(max(k // SLOW, 0), last_frame)
-        n_dem, p_s, t_oil = rows[frame, S_N_DEM], rows[frame, S_P_S], rows[frame, S_T_OIL]
-        heard = rows[frame, S_N_R]
-        if heard != heard:
-            heard = s[N_R, j] + sigma[1 + stages, j] * noise[first if noisy else 0, 1 + stages]
-        inputs.n_dem, inputs.n_r, inputs.mode_request = n_dem, heard, rows[frame, S_MODE_REQUEST]
-        inputs.demand_fresh, inputs.demand_rejected = rows[frame, S_FRESH], rows[frame, S_REJECTED]
+        many = min(_stretch(hears, k), ticks - first)
+        n_dem, n_r, p_s, t_oil = _hear(
+            hears, k, j, inputs, cal.k, s[N_R, j], sigma[speed, j], noise[first if noisy else 0, speed]
+        )
         for i in range(many):
             m = first + i if noisy else 0
             inputs.x_lvdt = sample_lvdt(s, p, j, sigma_lvdt * noise[m, 0], t_oil)
             tick(inputs, state, cal)
-            if k + i >= 0 and (k + i) % every == 0:
-                error = abs(state.x_dem - inputs.x_lvdt)
-                found[SERVO, j] = max(found[SERVO, j], error)
-                found[SAMPLES + int(state.mode), j] += 1.0
-                if not error < np.inf:
-                    found[LOST, j] += 1.0
-                if k + i == last:
-                    found[LAST_MODE, j], found[LAST_STROKE, j] = state.mode, inputs.x_lvdt
-            drive_step(s, p, j, state.i_cmd, heard, p_s, t_oil, TICK, SUBSTEPS)
+            _tick(notes, k + i, j, state, inputs)
+            drive_step(s, p, j, state.i_cmd, n_r, p_s, t_oil, TICK, SUBSTEPS)
             strokes[i] = s[X, j]
             inputs.demand_fresh = inputs.demand_rejected = 0.0
         # what turns behind the piston, and the engine, push back on neither: 10 ms of theirs at a stretch find their
         # parameters near at hand
         for i in range(many):
             m = first + i if noisy else 0
-            if k + i >= 0 and (k + i) % every == 0:
-                for q in range(stages):
-                    angle = s[POT + q, j] + sigma[1 + q, j] * noise[m, 1 + q]
-                    error = abs(angle - look_up(0, 1 + q, targets, heard))
-                    found[ANGLE_ERROR + q, j] = max(found[ANGLE_ERROR + q, j], error)
-                    if not error < np.inf:
-                        found[LOST, j] += 1.0
-                    if k + i == last:
-                        found[ANGLE_LAST + q, j] = angle
+            _before(notes, k + i, j, s, sigma, noise, m, n_r)
             s[X, j] = strokes[i]
             rotor_step(s, p, j, n_dem, TICK)
-            vane_step(s, p, j, heard, t_oil, (k + i + 1) * TICK)
+            vane_step(s, p, j, n_r, t_oil, (k + i + 1) * TICK)
+            _after(notes, k + i, j, s, sigma, noise, m, n_r)
+        first += many
     _put(z, j, state)
 
 
@@ -275,12 +378,10 @@ def _jit_options(simulated: bool) -> dict[str, Any]:
 
 
 class Kernel:
-    """`_run` on this computer's GPU."""
+    """`_run` on this computer's GPU, with what its loops hear and what is noted of them."""
 
-    def __init__(self) -> None:
-        here = _cuda()
-        if not here.is_available():
-            raise here.cudadrv.error.CudaSupportError(f"no GPU can be used: {here.cuda_error() or NOTHING_TO_COMPILE}")
+    def __init__(self, watched: Watched = FIGURES) -> None:
+        here = check()
         self.cuda, self.simulated = here, bool(here.config.ENABLE_CUDASIM)
         self.name = "numba's simulator" if self.simulated else here.get_current_device().name
         if isinstance(self.name, bytes):
@@ -292,10 +393,12 @@ class Kernel:
         instead[curve.bend] = _zero
         if not self.simulated:
             instead[np.floor] = math.floor  # on a GPU it gives a floating-point number, of infinity too
+            instead[np.rint] = _nearest(importlib.import_module("numba.cuda.libdevice"))  # numba-cuda has no np.rint
         records = (_Inputs, _State) if self.simulated else map(numba.from_dtype, (_Inputs, _State))
         names = dict(zip(("_Inputs", "_State"), records, strict=True))
         copies = _Copies(here, instead, self.simulated)
         moved = {"_take": copies.device(_take), "_put": copies.device(_put), "cuda": here, **names}
+        moved |= {f"_{name}": copies.device(copies.copy(f)) for name, f in watched._asdict().items()}
         self.functions = [copies.copy(_run, **moved, _own=copies.device(f)) for f in (_the_only, _own)]
         self._kernels = [here.jit(f, **_jit_options(self.simulated)) for f in self.functions]
 
@@ -310,17 +413,28 @@ class Kernel:
             raise MemoryError(f"{free / 2**20:.1f} MiB of its memory are free, {THREADS * each / 2**20:.1f} are needed")
         return int(fit)
 
-    def __call__(self, engines: int, *arguments: Any) -> None:
-        """Run it for so many engines; arguments as of `_run`, arrays those of the GPU."""
+    def __call__(self, k0: int, ticks: int, noise: Any, machines: Machines, hears: Any, notes: Any) -> None:
+        """Advance the engines; arguments as of `_run`, arrays those of the GPU."""
+        engines = machines.s.shape[1]
         with _unfused(self.cuda):  # the first call compiles
-            kernel = self._kernels[not isinstance(arguments[SCALARS_AT], Scalars)]
-            kernel[-(-engines // THREADS), min(THREADS, engines)](*arguments)
+            kernel = self._kernels[not isinstance(machines.scalars, Scalars)]
+            kernel[-(-engines // THREADS), min(THREADS, engines)](k0, ticks, noise, *machines, hears, notes)
 
 
 def _cuda() -> Any:
     """numba-cuda. Raises InputError where it is not installed."""
     needs("device='cuda'", "numba_cuda")
     return importlib.import_module("numba.cuda")
+
+
+def check() -> Any:
+    """numba-cuda, where this computer has a GPU that it can use: raises one of `unusable` where not. Takes nothing of
+    the GPU's memory.
+    """
+    here = _cuda()
+    if not here.is_available():
+        raise here.cudadrv.error.CudaSupportError(f"no GPU can be used: {here.cuda_error() or NOTHING_TO_COMPILE}")
+    return here
 
 
 @contextlib.contextmanager
@@ -350,6 +464,6 @@ def said(e: Exception) -> str:
 
 
 @cache
-def kernel() -> Kernel:
+def kernel(watched: Watched = FIGURES) -> Kernel:
     """The kernel, compiled when it first runs. Raises one of `unusable` where there is none."""
-    return Kernel()
+    return Kernel(watched)

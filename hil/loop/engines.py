@@ -8,8 +8,8 @@ raster of the log while the loop runs.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from controller import Calibration, new_state
 from controller.records import MODES, SCALAR_FIELDS, STATE, kind
 from hil.loop import cuda as gpu
 from hil.loop.firmware_lanes import runs_in_lanes
+from hil.loop.heard_lanes import change_machine
 from hil.loop.lanes import lockstep_lanes, loops_of
 from hil.loop.lockstep import CHUNK, S_N_DEM, S_N_R, S_T_OIL, WARM_UP, Run, Stimulus
 from hil.loop.tick import CHANGED_BY, flashed, mean_stroke
@@ -27,7 +28,10 @@ from plant.parameters import ACTUATORS, KIND
 from vaneloop.base.compiled import in_place, threads
 from vaneloop.base.errors import InputError
 
-__all__ = ["DEVICES", "Engines", "Unfinished", "lockstep_engines", "put_on_gpu"]
+__all__ = [
+    "DEVICES", "MOST", "SHARE", "Engines", "Unfinished", "change_on_gpu", "lockstep_engines", "machines_on_gpu",
+    "on_gpu", "put_on_gpu",
+]  # fmt: skip
 
 DEVICES = ("auto", "cpu", "cuda")
 AT_ONCE = 128  # engines whose logs the processor has at once, for each of its cores
@@ -197,34 +201,36 @@ def _numbers(of: list[Any]) -> tuple[np.ndarray, list[Any]]:
     return which, [of[int(i)] for i in np.unique(which, return_index=True)[1]]
 
 
-def _flashed(plants: list[Plant], cals: list[Calibration]) -> list[Calibration]:
-    """Each engine's calibration as it is flashed; the same object where it is the same."""
+def _flashed(plants: Sequence[Plant], cals: Sequence[Calibration], p: np.ndarray) -> list[Calibration]:
+    """Each engine's calibration as it is flashed, its parameters p[:, engine]; the same object where it is the same."""
     known: dict[Any, Calibration] = {}
     out = []
-    for plant, cal in zip(plants, cals, strict=True):
-        key = (id(cal), *(plant.p[row, 0] for row in CHANGED_BY))
+    for j, (plant, cal) in enumerate(zip(plants, cals, strict=True)):
+        key = (id(cal), *p[list(CHANGED_BY), j])
         if key not in known:
-            known[key] = flashed(cal, plant)
+            known[key] = flashed(cal, replace(plant, p=p[:, j : j + 1].copy()))
         out.append(known[key])
     return out
 
 
 def _on_gpu(kernel: gpu.Kernel, work: _Work, some: np.ndarray) -> None:
     """Run engines on the GPU; what they come to is written down when all of them are at the end."""
-    n, out = len(some), work.out
+    out = work.out
     plants = [work.plants[i] for i in some]
     stages = _stages(plants[0])
     last = (work.ticks - 1) // work.every * work.every
-    arrays = put_on_gpu(kernel, plants, [work.cals[i] for i in some], [work.stimuli[i] for i in some], work.seed)
+    machines, hears, notes = put_on_gpu(
+        kernel, plants, [work.cals[i] for i in some], [work.stimuli[i] for i in some], work.seed, work.every, last
+    )
     silent = kernel.cuda.to_device(np.zeros((1, 2 + stages)))
-    kernel(n, -WARM_UP, WARM_UP, work.every, last, silent, *arrays)
+    kernel(-WARM_UP, WARM_UP, silent, machines, hears, notes)
     generator = np.random.Generator(np.random.PCG64(work.seed or 0))
     for k0 in range(0, work.ticks, CHUNK):
         ticks, noise = min(CHUNK, work.ticks - k0), silent
         if work.seed is not None:
             noise = kernel.cuda.to_device(generator.standard_normal((ticks, 2 + stages)))
-        kernel(n, k0, ticks, work.every, last, noise, *arrays)
-    z, found = (a.copy_to_host() for a in arrays[-2:])
+        kernel(k0, ticks, noise, machines, hears, notes)
+    z, found = machines.z.copy_to_host(), notes.found.copy_to_host()
     out.servo_error[some], out.stroke[some] = 1e3 * found[gpu.SERVO], 1e3 * found[gpu.LAST_STROKE]
     out.angle_error[some, :stages] = DEG * found[gpu.ANGLE_ERROR : gpu.ANGLE_ERROR + stages].T
     out.angles[some, :stages] = DEG * found[gpu.ANGLE_LAST : gpu.ANGLE_LAST + stages].T
@@ -235,33 +241,96 @@ def _on_gpu(kernel: gpu.Kernel, work: _Work, some: np.ndarray) -> None:
 
 
 def put_on_gpu(
-    kernel: gpu.Kernel, plants: list[Plant], cals: list[Calibration], stimuli: list[Stimulus], seed: int | None
-) -> list[Any]:
-    """Engines at rest as arrays on the GPU: the arguments of `hil.loop.cuda.Kernel` from ``stimuli`` on."""
-    n, stages = len(plants), _stages(plants[0])
+    kernel: gpu.Kernel,
+    plants: list[Plant],
+    cals: list[Calibration],
+    stimuli: list[Stimulus],
+    seed: int | None,
+    every: int,
+    last: int,
+) -> tuple[gpu.Machines, gpu.Frames, gpu.Figures]:
+    """Engines at rest as arrays on the GPU, with what they hear and what is to be noted of them."""
+    n = len(plants)
     which, stimuli = _numbers(stimuli)
-    own, cals = _numbers(_flashed(plants, cals))
-    p = np.ascontiguousarray(np.array([plant.p[: gpu.P_ROWS, 0] for plant in plants]).T)
-    sigma = np.array([plant.sigma for plant in plants]).T if seed is not None else np.zeros((2 + stages, n))
     first = np.array([s.rows[0] for s in stimuli])[which]
     n_r = np.where(np.isfinite(first[:, S_N_R]), first[:, S_N_R], first[:, S_N_DEM])
-    strokes = np.array([mean_stroke(cals[c].table, v) for c, v in zip(own, n_r, strict=True)])
-    s = np.zeros((chain.N_STATE, n))
-    _at_rest(s, p, strokes, first[:, S_N_DEM].copy(), first[:, S_T_OIL].copy())
+    machines = machines_on_gpu(kernel, plants, cals, first[:, S_N_DEM], n_r, first[:, S_T_OIL], seed is not None)
     speed, target = plants[0].schedules.arrays()
-    scalars: Any = np.array([cal.k for cal in cals]).view(kind(SCALAR_FIELDS))[:, 0]
-    if len(cals) == 1:
+    rows, numbers, targets, found = (
+        on_gpu(kernel, a)
+        for a in (np.array([s.rows for s in stimuli]), which, np.vstack([speed, target.T]), np.zeros((gpu.FOUND, n)))
+    )
+    return machines, gpu.Frames(rows, numbers), gpu.Figures(every, last, targets, found)
+
+
+def machines_on_gpu(
+    kernel: gpu.Kernel,
+    plants: Sequence[Plant],
+    cals: Sequence[Calibration],
+    n_engine: np.ndarray,
+    n_r: np.ndarray,
+    t_oil: np.ndarray,
+    noisy: bool,
+) -> gpu.Machines:
+    """Engines at rest on the GPU, as `hil.loop.tick.new_loop` has them: each at its speed (%) and oil temperature
+    (degC), its stroke where the mean curve has it at the measured speed ``n_r`` (%).
+    """
+    n = len(plants)
+    p = np.ascontiguousarray(np.array([plant.p[: gpu.P_ROWS, 0] for plant in plants]).T)
+    own, scalars, tables, angles, flashes = _calibrations(kernel, plants, cals, p)
+    sigma = np.array([plant.sigma for plant in plants]).T if noisy else np.zeros((len(plants[0].sigma), n))
+    strokes = np.array([mean_stroke(cal.table, v) for cal, v in zip(flashes, n_r, strict=True)])
+    s = np.zeros((chain.N_STATE, n))
+    _at_rest(s, p, strokes, np.ascontiguousarray(n_engine), np.ascontiguousarray(t_oil))
+    z = np.repeat(new_state()[: gpu.Z_ROWS, None], n, axis=1)
+    sigma, s, p, z = (on_gpu(kernel, a) for a in (sigma, s[: gpu.S_ROWS], p, z))
+    return gpu.Machines(sigma, own, scalars, tables, angles, s, p, z)
+
+
+def change_on_gpu(
+    kernel: gpu.Kernel,
+    machines: gpu.Machines,
+    plants: Sequence[Plant],
+    cals: Sequence[Calibration],
+    values: Sequence[Mapping[int, float]],
+) -> gpu.Machines:
+    """Engines on the GPU after rows of each one's parameters, the same of all, have got other values (SI)."""
+    s, p, z = (np.ascontiguousarray(a.copy_to_host()) for a in (machines.s, machines.p, machines.z))
+    rows = np.array(list(values[0]), np.int64)
+    _change(s, p, z[STATE.index("i_cmd")], rows, np.array([[of[r] for of in values] for r in rows]))
+    own, scalars, tables, angles, _ = _calibrations(kernel, plants, cals, p)
+    s, p = on_gpu(kernel, s), on_gpu(kernel, p)
+    return machines._replace(own=own, scalars=scalars, tables=tables, angles=angles, s=s, p=p)
+
+
+@in_place
+def _change(s: np.ndarray, p: np.ndarray, i_cmd: np.ndarray, rows: np.ndarray, values: np.ndarray) -> None:
+    for j in range(s.shape[1]):
+        change_machine(s, p, j, i_cmd[j], rows, values[:, j])
+
+
+def _calibrations(
+    kernel: gpu.Kernel, plants: Sequence[Plant], cals: Sequence[Calibration], p: np.ndarray
+) -> tuple[Any, Any, Any, Any, list[Calibration]]:
+    """What engines have flashed, as the GPU has it (own, scalars, tables, angles of `hil.loop.cuda.Machines`), and the
+    calibration of each engine.
+    """
+    flashes = _flashed(plants, cals, p)
+    own, differ = _numbers(flashes)
+    scalars: Any = np.array([cal.k for cal in differ]).view(kind(SCALAR_FIELDS))[:, 0]
+    if len(differ) == 1:
         scalars = gpu.Scalars(
             *(tuple(v) if f.each else v for f, v in zip(SCALAR_FIELDS, scalars[0].tolist(), strict=True))
         )
-    tables, angles = (np.array([getattr(cal, name) for cal in cals]) for name in ("table", "angles"))
-    z = np.repeat(new_state()[: gpu.Z_ROWS, None], n, axis=1)
-    arrays = (
-        np.array([s.rows for s in stimuli]), which, sigma, own, scalars, tables, angles, np.vstack([speed, target.T]),
-        s[: gpu.S_ROWS], p, z, np.zeros((gpu.FOUND, n)),
-    )  # fmt: skip
-    put = kernel.cuda.to_device
-    return [a if isinstance(a, gpu.Scalars) else put(np.ascontiguousarray(a)) for a in arrays]
+    else:
+        scalars = on_gpu(kernel, scalars)
+    tables, angles = (on_gpu(kernel, np.array([getattr(cal, name) for cal in differ])) for name in ("table", "angles"))
+    return on_gpu(kernel, own), scalars, tables, angles, flashes
+
+
+def on_gpu(kernel: gpu.Kernel, a: np.ndarray) -> Any:
+    """An array on the GPU."""
+    return kernel.cuda.to_device(np.ascontiguousarray(a))
 
 
 def _on_processor(work: _Work, some: np.ndarray) -> None:

@@ -9,24 +9,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from controller import Calibration
 from controller.records import SLOW
-from hil.bus.frames import decode_demand, encode_demand
+from hil.bus.frames import raw_speed, speed_of
 from hil.loop import firmware_lanes
 from hil.loop.lanes import BLOCK, EIGHT, aligned, place_machine
 from hil.loop.tick import Loop, flashed, new_loop
 from plant import Plant, chain, chain_lanes, places
 from plant.chain_lanes import W
 from plant.lanes import wide_vectors
-from plant.parameters import derive
-from vaneloop.base.compiled import compiled, in_place_free
+from plant.parameters import derive_lane
+from vaneloop.base.compiled import compiled, in_place, in_place_free, inlined
 
 __all__ = [
-    "H_DEMAND", "H_FRESH", "H_N_DEM", "H_N_R", "H_P_S", "H_REJECTED", "H_REQUEST", "H_SOURCE", "H_T_OIL", "N_HEARD",
-    "HeardLanes", "noise_of", "power_on",
+    "COLUMNS", "H_DEMAND", "H_FRESH", "H_N_DEM", "H_N_R", "H_P_S", "H_REJECTED", "H_REQUEST", "H_SOURCE", "H_T_OIL",
+    "N_HEARD", "OIL", "HeardLanes", "Rows", "believed", "change_machine", "depth", "hear_row", "noise_of", "power_on",
+    "sample", "speed_in", "speed_sent", "stretch_of", "stretches",
 ]  # fmt: skip
 
 # columns of a row
@@ -44,6 +46,39 @@ __all__ = [
 ) = range(10)
 COLUMNS = 5  # of a sample before those of the vanes: x_dem, x_meas (m), i_cmd (A), n_dem, n_r_raw (%)
 OIL = 40.0  # degC, at power-on
+
+
+@inlined
+def speed_sent(n_r: float, sigma: float, noise: float) -> float:
+    """The speed (%) in the ECU's frame: the engine's, as measured, in the steps of the frame; ``noise``: standard
+    normal.
+    """
+    return speed_of(raw_speed(n_r + sigma * noise))
+
+
+@inlined
+def speed_in(now: np.ndarray, sent: float) -> float:
+    """The speed (%) in the frame that comes with a row; ``sent``: of the ECU's frame from which the row has it."""
+    if now[H_SOURCE] < 0.0:
+        return now[H_N_R]
+    if now[H_N_R] != 0.0:
+        return speed_of(raw_speed(sent) ^ raw_speed(now[H_N_R]))
+    return sent
+
+
+@inlined
+def believed(now: np.ndarray, speed: float, low: float, high: float) -> bool:
+    """Whether the machine goes on at the speed (%) of a frame: its values are within the firmware's range (%)."""
+    return low <= now[H_N_DEM] <= high and low <= speed <= high and now[H_REQUEST] <= 1.0
+
+
+@in_place
+def change_machine(s: np.ndarray, p: np.ndarray, j: int, i_cmd: float, rows: np.ndarray, values: np.ndarray) -> None:
+    """Give rows of a machine's parameters other ``values`` (SI) between two ticks; ``i_cmd``: A, of the last one."""
+    chain.wake(s, p, j, i_cmd)
+    for q in range(rows.shape[0]):
+        p[rows[q], j] = values[q]
+    derive_lane(p, j, chain.TICK / chain.SUBSTEPS, chain.TICK)
 
 
 @compiled
@@ -84,21 +119,14 @@ def _advance(
         if phase == 0:
             frame = k // SLOW
             for j in range(n):
-                speed = b.n_r[j] + b.sigma_speed[j] * speed_noise[frame]
-                sent[frame, j] = decode_demand(encode_demand(0.0, speed, 0, 0))[1]
+                sent[frame, j] = speed_sent(b.n_r[j], b.sigma_speed[j], speed_noise[frame])
                 b.n_dem[j] = now[H_DEMAND]
         if came:
-            source = int(now[H_SOURCE])
+            source = max(int(now[H_SOURCE]), 0)
             for j in range(n):
-                speed = now[H_N_R]
-                if source >= 0:
-                    speed = sent[source, j]
-                    if now[H_N_R] != 0.0:
-                        word = encode_demand(0.0, speed, 0, 0) ^ encode_demand(0.0, now[H_N_R], 0, 0)
-                        speed = decode_demand(word)[1]
+                speed = speed_in(now, sent[source, j])
                 b.in_n_dem[j], b.in_n_r[j], b.in_mode_request[j] = now[H_N_DEM], speed, now[H_REQUEST]
-                low, high = b.k_demand_low[j], b.k_demand_high[j]
-                if low <= now[H_N_DEM] <= high and low <= speed <= high and now[H_REQUEST] <= 1.0:
+                if believed(now, speed, b.k_demand_low[j], b.k_demand_high[j]):
                     b.heard[j] = speed
         if i == 0 or came or now[H_P_S] != rows[k - 1, H_P_S] or now[H_T_OIL] != rows[k - 1, H_T_OIL]:
             for j in range(n):
@@ -136,6 +164,74 @@ def noise_of(seed: int, ticks: int, stages: int) -> tuple[np.ndarray, np.ndarray
     """
     sensors, speed = (np.random.Generator(np.random.PCG64(seed + q)) for q in range(2))
     return sensors.standard_normal((ticks, 2 + stages)), speed.standard_normal(-(-ticks // SLOW))
+
+
+class Rows(NamedTuple):
+    """What engines on a GPU hear (`hil.loop.cuda.Watched`): rows of a scenario.
+
+    rows     float64[ticks, N_HEARD]
+    stretch  int64[ticks] from each tick on: ticks in which nothing comes and the supply stays, up to the ECU's next one
+    noise    float64[frames] standard normal numbers of the ECU's measured speed
+    sent     float64[depth, engine] %, measured speeds that the ECU has sent last: frame n in row n % depth
+    speed    float64[engine] %, of the last frame that was believed
+    """
+
+    rows: Any
+    stretch: Any
+    noise: Any
+    sent: Any
+    speed: Any
+
+
+def stretches(rows: np.ndarray) -> np.ndarray:
+    """`Rows.stretch`: how many ticks from each on have nothing new after their first one."""
+    new = (rows[:, H_FRESH] > 0.5) | (rows[:, H_REJECTED] > 0.0)
+    new[1:] |= (rows[1:, [H_P_S, H_T_OIL]] != rows[:-1, [H_P_S, H_T_OIL]]).any(axis=1)
+    new[::SLOW] = True
+    begins = np.append(np.flatnonzero(new), len(rows))
+    ticks = np.arange(len(rows))
+    return begins[np.searchsorted(begins, ticks, side="right")] - ticks
+
+
+def depth(rows: np.ndarray) -> int:
+    """How many of the ECU's last frames a controller may still get."""
+    came = np.flatnonzero((rows[:, H_FRESH] > 0.5) & (rows[:, H_SOURCE] >= 0.0))
+    return int(np.max(came // SLOW - rows[came, H_SOURCE], initial=0)) + 1
+
+
+def stretch_of(hears: Rows, k: int) -> int:
+    """`hil.loop.cuda.Watched.stretch` of rows."""
+    return hears.stretch[k]
+
+
+def hear_row(
+    hears: Rows, k: int, j: int, inputs: Any, k_of: Any, n_r: float, sigma: float, noise: float
+) -> tuple[float, float, float, float]:
+    """`hil.loop.cuda.Watched.hear` of rows."""
+    now, kept, frame = hears.rows[k], hears.sent.shape[0], k // SLOW
+    if k % SLOW == 0:
+        hears.sent[frame % kept, j] = speed_sent(n_r, sigma, hears.noise[frame])
+    if now[H_FRESH] > 0.5:
+        speed = speed_in(now, hears.sent[max(int(now[H_SOURCE]), 0) % kept, j])
+        inputs.n_dem, inputs.n_r, inputs.mode_request = now[H_N_DEM], speed, now[H_REQUEST]
+        if believed(now, speed, k_of.demand_low, k_of.demand_high):
+            hears.speed[j] = speed
+    inputs.demand_fresh, inputs.demand_rejected = now[H_FRESH], now[H_REJECTED]
+    return now[H_DEMAND], hears.speed[j], now[H_P_S], now[H_T_OIL]
+
+
+@inlined
+def sample(z: Any, column: int) -> float:
+    """What the firmware's state ``z`` gives for a column of a sample before those of the vanes."""
+    if column == 0:
+        return z.x_dem
+    if column == 1:
+        return z.x_meas
+    if column == 2:
+        return z.i_cmd
+    if column == 3:
+        return z.n_dem
+    return z.n_r_raw
 
 
 class HeardLanes:
@@ -198,10 +294,8 @@ class HeardLanes:
         """Give rows of each machine's parameters other values (SI) before the next tick."""
         for j, (loop, new) in enumerate(zip(self.loops, values, strict=True)):
             _take_back(self._block, j, loop.s, self._stages)
-            chain.wake(loop.s, loop.p, 0, float(self._block[0]["z_i_cmd"][j]))
-            for r, v in new.items():
-                loop.p[r, 0] = v
-            derive(loop.p, chain.TICK / chain.SUBSTEPS, chain.TICK)
+            i_cmd = float(self._block[0]["z_i_cmd"][j])
+            change_machine(loop.s, loop.p, 0, i_cmd, np.array(list(new), np.int64), np.array(list(new.values()), float))
             cal = flashed(self._cals[j], replace(self._plants[j], p=loop.p))
             self.loops[j] = loop._replace(calibration=cal)
         self._place()
