@@ -26,7 +26,7 @@ from hil.inject.scenario import library
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import write
 from vaneloop.fleet.plan import Group, Varied, varied_by
-from vaneloop.fleet.together import Alone, in_lanes
+from vaneloop.fleet.together import Alone, side_by_side
 from vaneloop.fleet.trial import trial_once
 from vaneloop.verbs.machine import Machine
 
@@ -90,7 +90,7 @@ def compare(name: str, file: Path, varied: list[Varied], points: list[list[float
     """Run a scenario both ways."""
     files, g = {f"scenario.{name}": str(file)}, Group(name, "shipped", "shipped")
     started = time.process_time()
-    found = in_lanes(files, g, varied, points)
+    found = side_by_side(files, g, varied, points)
     lanes = time.process_time() - started
     why = next((one.why for one in found if isinstance(one, Alone)), "")
     if why:
@@ -98,7 +98,7 @@ def compare(name: str, file: Path, varied: list[Varied], points: list[list[float
     started = time.process_time()
     bus = [trial_once(files, g, varied, point) for point in points[:compared]]
     took = time.process_time() - started
-    said = [differ(a, b) for a, b in zip(bus, found, strict=False) if not isinstance(b, Alone)]
+    said = [differ(a, b.margins) for a, b in zip(bus, found, strict=False) if not isinstance(b, Alone)]
     return Compared(
         name, "", len(points), len(bus), sum(not a["held"] for a in bus), sum(v for v, _ in said),
         sum(m for _, m in said), took / len(bus), lanes / len(points),

@@ -13,6 +13,7 @@ import pytest
 from hil.inject.margin import Margin
 from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
+from vaneloop.fleet.together import Ran
 
 pytest.importorskip("psutil", reason="the extra `fleet` is not installed")
 
@@ -116,13 +117,14 @@ def test_a_scenario_both_ways_counts_what_differs(monkeypatch: pytest.MonkeyPatc
         True: [{"expected": "m", "held": True, "value": 0.5}],
         False: [{"expected": "m", "held": False, "value": -0.5}],
     }
-    lanes = [[held], [held], [broken], [Margin("m", True, 0.5 + 2e-9, "s", 0.5)], [held]]
+    lanes = [Ran([m]) for m in (held, held, broken, Margin("m", True, 0.5 + 2e-9, "s", 0.5), held)]
     bus = iter([True, False, False, True])
-    monkeypatch.setattr(campaign, "in_lanes", lambda files, g, varied, points: lanes)
+    monkeypatch.setattr(campaign, "side_by_side", lambda files, g, varied, points: lanes)
     monkeypatch.setattr(campaign, "trial_once", lambda *of: {"held": (h := next(bus)), "margins": rows[h]})
     found = campaign.compare("s", Path("s.toml"), [], [[0.0]] * 5, 4)
     assert (found.engines, found.compared, found.failed, found.verdicts, found.margins) == (5, 4, 2, 1, 2)
-    monkeypatch.setattr(campaign, "in_lanes", lambda files, g, varied, points: [[held], campaign.Alone("why")])
+    both = [Ran([held]), campaign.Alone("why")]
+    monkeypatch.setattr(campaign, "side_by_side", lambda files, g, varied, points: both)
     assert campaign.compare("s", Path("s.toml"), [], [[0.0]] * 2, 2).alone == "why"
 
 

@@ -358,13 +358,15 @@ def test_a_trial_s_file_says_what_is_to_be_done(tmp_path: Path, monkeypatch: pyt
         trial, "trial_once", lambda files, g, q, point: {"held": point[0] > 0.5, "of": [files, g, q, point]}
     )
     monkeypatch.setattr(trial, "_search", lambda *of: {"held": True, "of": list(of)})
-    monkeypatch.setattr(trial, "in_lanes", lambda files, g, q, points: [trial.Alone("why")] * len(points))
+    monkeypatch.setattr(trial, "side_by_side", lambda files, g, q, points, device: [trial.Alone("why")] * len(points))
     options = {"files": {"model": "machine/m.toml"}, "vary": [asdict(q) for q in TWO], "seed": 7}
     files, g = {"model": "/run/machine/m.toml"}, Group("s", "c", "f")
     asked: dict[str, Any] = {"group": ["s", "c", "f"], "point": [0.6, 0.1]}
     whole_json(tmp_path / "t.json", asked)
     said = trial.run_trial(str(tmp_path / "t.json"), options, "/run")
-    assert said == {"verdict": "held", "answer": {"held": True, "of": [files, g, TWO, [0.6, 0.1]], "alone": "why"}}
+    assert said == {"verdict": "held", "answer": {
+        "held": True, "of": [files, g, TWO, [0.6, 0.1]], "alone": "why", "ran": {"bus": 1},
+    }}  # fmt: skip
     whole_json(tmp_path / "t.json", asked | {"point": [0.5, 0.1]})
     assert trial.run_trial(str(tmp_path / "t.json"), options, "/run")["verdict"] == "failed"
     asked = {"group": ["s", "c", "f"], "search": 3}
@@ -378,11 +380,11 @@ def test_samples_of_one_group_run_in_lanes_together_and_their_answers_are_kept(
     ran: list[Any] = []
     margin = trial.Margin("e", True, 2.0, "mm", 0.5)
 
-    def lanes(files: Any, g: Group, quantities: Any, points: Any) -> list[Any]:
+    def lanes(files: Any, g: Group, quantities: Any, points: Any, device: str) -> list[Any]:
         ran.append((g.name, [list(p) for p in points]))
-        return [[margin] if p[0] < 0.5 else trial.Alone("why") for p in points]
+        return [trial.Ran([margin], device, "n") if p[0] < 0.5 else trial.Alone("why") for p in points]
 
-    monkeypatch.setattr(trial, "in_lanes", lanes)
+    monkeypatch.setattr(trial, "side_by_side", lanes)
     monkeypatch.setattr(trial, "trial_once", lambda files, g, q, point: {"held": False, "point": point})
     monkeypatch.setattr(trial, "_kept", {})
     asked = {
@@ -397,14 +399,14 @@ def test_samples_of_one_group_run_in_lanes_together_and_their_answers_are_kept(
     at = {name: str(tmp_path / f"{name}.json") for name in (*asked, "none")}
 
     def answer(name: str, *beside: str) -> dict[str, Any]:
-        return dict(trial.run_trial(at[name], options, "/run", [at[n] for n in beside])["answer"])
+        return dict(trial.run_trial(at[name], options, "/run", [at[n] for n in beside], "a GPU")["answer"])
 
     in_lanes = {"held": True, "margins": [{"expected": "e", "held": True, "value": 2.0, "unit": "mm", "share": 0.5}],
-                "state_hash": None, "seen": [], "alone": ""}  # fmt: skip
+                "state_hash": None, "seen": [], "alone": "", "ran": {"a GPU": 1}, "note": "n"}  # fmt: skip
     assert answer("a", *at) == {"point": [0.1, 0.1], **in_lanes}
     assert ran == [("s.c.f", [[0.1, 0.1], [0.2, 0.1], [0.9, 0.1]])]
     assert answer("b") == {"point": [0.2, 0.1], **in_lanes} and len(ran) == 1  # kept, and asked for once
-    assert answer("c") == {"point": [0.9, 0.1], "held": False, "alone": "why"} and trial._kept == {}
+    assert answer("c") == {"point": [0.9, 0.1], "held": False, "alone": "why", "ran": {"bus": 1}} and trial._kept == {}
     assert answer("b")["alone"] == "" and ran[1] == ("s.c.f", [[0.2, 0.1]])
     with pytest.raises(InputError, match=r"bad.json: is no trial of a campaign \(what: Extra inputs"):
         trial.run_trial(at["bad"], options, "/run")
@@ -567,19 +569,21 @@ def test_the_levels_of_a_subset_simulation_run_in_lanes_and_alone_where_they_can
     machines = Machines(monkeypatch, lambda u: 0.5 * (limit - u.sum()))
     lanes: list[int] = []
 
-    def in_lanes(files: Any, g: Any, quantities: Any, points: list[list[float]]) -> list[Any]:
+    def side_by_side(files: Any, g: Any, quantities: Any, points: list[list[float]], device: str) -> list[Any]:
         lanes.append(len(points))
-        return [
-            trial.Alone("why") if i % 7 == 0 else [Margin("m", (s := 0.5 * (limit - sum(u))) >= 0.0, s, "deg", s)]
-            for i, u in enumerate(points)
-        ]
+        margins = [Margin("m", (s := 0.5 * (limit - sum(u))) >= 0.0, s, "deg", s) for u in points]
+        return [trial.Alone("why") if i % 7 == 0 else trial.Ran([m], device) for i, m in enumerate(margins)]
 
-    monkeypatch.setattr(trial, "in_lanes", in_lanes)
+    monkeypatch.setattr(trial, "side_by_side", side_by_side)
     points = np.random.default_rng(3).random((300, 2)).tolist()
     known = [(u, 0.5 * (limit - sum(u))) for u in points]
     asked = {"subset": True, "among": ["m"], "known": known}
-    said = [trial._subset({}, Group("s", "c", "f"), TWO, asked, seed) for seed in (1, 1, 2)]
+    said = [trial._subset({}, Group("s", "c", "f"), TWO, asked, seed, "a GPU") for seed in (1, 1, 2)]
     answer, same, other = said
+    assert 3 * sum(answer["ran"].values()) == pytest.approx(sum(lanes), rel=0.2) and set(answer["ran"]) == {
+        "a GPU",
+        "bus",
+    }
     assert answer["point"] == same["point"] != other["point"] and answer["subset"] == same["subset"]
     found = answer["subset"]
     p = np.prod([share for _, share, _ in found["levels"]])
@@ -587,8 +591,9 @@ def test_the_levels_of_a_subset_simulation_run_in_lanes_and_alone_where_they_can
     assert 3 * found["runs"] == pytest.approx(sum(lanes), rel=0.2) and len(machines.runs) > sum(lanes) // 8
     assert not answer["held"] and answer["margins"][0]["share"] < 0.0 and sum(answer["point"]) > limit
     assert trial.is_answer(json.loads(json.dumps({"state_hash": None, "seen": [], **answer})))
-    monkeypatch.setattr(trial, "in_lanes", lambda files, g, q, of: [[Margin("m", True, 0.4, "", 0.4)]] * len(of))
-    still = trial._subset({}, Group("s", "c", "f"), TWO, asked | {"known": [(u, 0.4) for u in points]}, 1)
+    level = trial.Ran([Margin("m", True, 0.4, "", 0.4)])
+    monkeypatch.setattr(trial, "side_by_side", lambda files, g, q, of, device: [level] * len(of))
+    still = trial._subset({}, Group("s", "c", "f"), TWO, asked | {"known": [(u, 0.4) for u in points]}, 1, "cpu")
     assert still["point"] == min(points) and still["subset"] == {
         "levels": [(0.0, 0.0, 0.0)],
         "reached": False,

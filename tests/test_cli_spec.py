@@ -376,7 +376,7 @@ def test_a_campaign_is_told_and_written_for_junit(tmp_path: Path, capsys: Said) 
             group(name="calm", failed=0, requirements=[], alone={}, lost=0, runs=4, same=True, reproduces=True),
         ],
         passed=lambda g: g.name == "calm", confidence=0.95, title="a campaign", allowed=None,
-        sentence=lambda: "so it is",
+        sentence=lambda: "so it is", simulated_s={"cpu": 1.0}, simulated_on="Simulated: 1 s", notes=["no GPU"],
     )  # fmt: skip
     campaign._show(args(), view, 5)
     said = lines(capsys)
@@ -386,7 +386,11 @@ def test_a_campaign_is_told_and_written_for_junit(tmp_path: Path, capsys: Said) 
     assert "on the lockstep bus, not in lanes: 3 of 9 machines of gust: its bus" in said
     assert any(s.startswith("without an answer: 1 trials of gust") for s in said)
     assert [s for s in said if s.startswith("no search")] == ["no search in gust: too few of its trials have an answer"]
-    assert said.count("worst case: vaneloop campaign again") == 2 and said[-1] == "so it is"
+    assert said.count("worst case: vaneloop campaign again") == 2 and said[-3:] == [
+        "Simulated: 1 s",
+        "no GPU",
+        "so it is",
+    ]
     campaign._show(args(), view, 0)
     assert not any(s.startswith("no search") for s in lines(capsys))
     campaign._write_junit(str(tmp_path / "j.xml"), view)

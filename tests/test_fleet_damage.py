@@ -53,10 +53,10 @@ BAD_VALUES: tuple[Any, ...] = (
 class Stand:
     """A reader that answers at once."""
 
-    def __init__(self, kind: str, run: str, stopped: threading.Event):
+    def __init__(self, kind: str, run: str, stopped: threading.Event, device: str):
         """As `vaneloop.fleet.reader.Reader`."""
 
-    def ask(self, path: str, options: dict[str, Any], limit: float, beside: Any = ()) -> dict[str, Any]:
+    def ask(self, path: str, options: dict[str, Any], limit: float, *beside: Any) -> dict[str, Any]:
         """An answer as a diagnosis has it."""
         return {"status": "done", "reason": "", "verdict": "missing", "answer": answer(len(path))}
 
@@ -490,7 +490,7 @@ def test_code_of_a_run_folder_runs_only_where_the_user_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     asked: list[str] = []
-    monkeypatch.setattr(Stand, "ask", lambda self, path, options, limit, beside: asked.append(path) or {
+    monkeypatch.setattr(Stand, "ask", lambda self, path, options, limit, *more: asked.append(path) or {
         "status": "done", "reason": "", "verdict": "none", "answer": {}})  # fmt: skip
     (tmp_path / "mine.py").write_text("raise SystemExit('run')\n")
     (tmp_path / "a.csv").write_text("log")

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -22,7 +23,7 @@ import pytest
 pytest.importorskip("psutil", reason="the extra `fleet` is not installed")
 pytest.importorskip("duckdb", reason="the extra `fleet` is not installed")
 
-from vaneloop.base.errors import InputError
+from vaneloop.base.errors import DeviceError, InputError
 from vaneloop.fleet import diagnosis, reader, rent, worker
 from vaneloop.fleet.files import read_json, whole_json
 from vaneloop.fleet.folder import Folder, key_of
@@ -45,16 +46,20 @@ class Readings:
         self.says: dict[str, list[Any]] = {}
         self.asked: list[str] = []
         self.words: tuple[Any, ...] = ()
+        self.with_others: list[tuple[int, str]] = []  # of each question: how many beside, and the device
         self.limits: set[tuple[str, float]] = set()
         self.stops = 0
         self.stopped = threading.Event()
 
-    def __call__(self, function: str, folder: str, stopped: threading.Event) -> Readings:
-        self.words, self.stopped = (function, folder), stopped
+    def __call__(self, function: str, folder: str, stopped: threading.Event, device: str) -> Readings:
+        self.words, self.stopped = (function, folder, device), stopped
         return self
 
-    def ask(self, path: str, options: dict[str, Any], limit: float, beside: Any = ()) -> dict[str, Any]:
+    def ask(
+        self, path: str, options: dict[str, Any], limit: float, beside: Any = (), device: str = ""
+    ) -> dict[str, Any]:
         self.asked.append(Path(path).name)
+        self.with_others.append((len(beside), device))
         self.limits.add((json.dumps(options), limit))
         left = self.says.get(Path(path).name, [])
         what = left.pop(0) if left else DONE
@@ -110,7 +115,9 @@ def test_a_worker_does_every_log_writes_down_what_it_does_and_leaves_nothing(
     assert work(run.path) == {"done": 3}
     assert sorted(readings.asked) == ["a.csv", "b.csv", "c.csv"]
     assert (
-        readings.words == ("one", str(run.path)) and readings.limits == {('{"limit": 7}', 7.0)} and readings.stops == 1
+        readings.words == ("one", str(run.path), "auto")
+        and readings.limits == {('{"limit": 7}', 7.0)}
+        and readings.stops == 1
     )
     first, second = run.chunks()
     said = journal(run)
@@ -310,6 +317,39 @@ def test_a_log_that_takes_too_long_is_not_tried_again(tmp_path: Path, readings: 
     assert readings.asked == ["a.csv"]
 
 
+def test_after_a_failure_a_log_is_tried_without_others_and_with_auto_on_the_processor(
+    tmp_path: Path, readings: Readings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(KINDS, "one", replace(ONE, together=True))
+    late, killed = TimedOut("no answer in 7 s"), Died("signal 9")
+    readings.says = {"a.csv": [late, killed, DONE], "b.csv": [late, late]}
+    run = fleet(tmp_path, "abc", 3)
+    assert work(run.path, device="auto") == {"done": 2, "timeout": 1}
+    alone = (0, "cpu")
+    assert readings.with_others == [(2, ""), alone, alone, (1, ""), alone, (0, "")]
+    assert rows(run)["b"]["reason"] == "no answer in 7 s"
+
+
+def test_a_gpu_that_fails_costs_no_log_and_ends_the_work_with_a_line(tmp_path: Path, readings: Readings) -> None:
+    run = fleet(tmp_path, "abc", 3)
+    readings.says = {"b.csv": [DeviceError("device 'cuda': out of order")] * 20}
+    for _ in range(20):  # oftener than a log may end its worker
+        with pytest.raises(DeviceError, match="^device 'cuda': out of order$"):
+            work(run.path, device="cuda")
+    assert not run.finished() and readings.asked == ["a.csv", *["b.csv"] * 20], "what was done is kept"
+    assert not list((run.path / "leases").iterdir()) and ("device", "device 'cuda': out of order") in journal(run)
+    assert work(run.path, device="cuda") == {"done": 2} and set(rows(run)) == set("abc")
+    assert set(readings.with_others) == {(2, ""), (1, ""), (0, "")}, "no try counts, and the processor does nothing"
+
+
+def test_a_device_that_cannot_be_used_is_said_by_the_process_and_raised(popen: Any) -> None:
+    r, _ = reads(Process([b"{}\n", b'{"status": "device", "reason": "no GPU"}\n', b'{"a": 1}\n']))
+    popen(r)
+    with pytest.raises(DeviceError, match="^no GPU$"):
+        r.ask("/a", {}, 60.0, ["/b"], "cuda")
+    assert r.ask("/a", {}, 60.0) == {"a": 1}, "the process is there still"
+
+
 def test_a_defect_is_tried_once_more_by_a_new_process(tmp_path: Path, readings: Readings) -> None:
     run = fleet(tmp_path, "ab", 2)
     bad = {"status": "defect", "reason": "internal error: KeyError"}
@@ -479,8 +519,8 @@ def test_a_reader_has_its_process_compile_first_and_asks_it_log_by_log(
 
     monkeypatch.setattr(reader, "select", SimpleNamespace(select=wait))
     assert r.ask("/a", {"x": 1}, 60.0) == {"status": "done"} and r.ask("/b", {"x": 1}, 60.0) == {"b": 2}
-    asked = [{"path": path, "options": {"x": 1}, "beside": []} for path in ("/a", "/b")]
-    assert p.got == [{"options": {"x": 1}}, *asked]
+    asked = [{"path": path, "options": {"x": 1}, "beside": [], "device": "cpu"} for path in ("/a", "/b")]
+    assert p.got == [{"options": {"x": 1}, "device": "cpu"}, *asked]
     ((words, more),) = begun
     assert words[0] == sys.executable and words[1:3] == ["-P", "-c"] and words[4:] == ["one", "/run"]
     assert "serve()" in words[3]
@@ -821,8 +861,8 @@ def test_as_many_workers_are_rented_as_asked_for_and_what_they_did_is_added_up(
     run, told = fleet(tmp_path, "abc"), []
     assert rent.rent(run, "local", 2, {}, 0.5, lambda n, of: told.append((n, of)), "sha") == {"done": 5, "died": 1}
     assert told and set(told) == {(0, 3)}
-    ((folder, starter, every, trust),) = hands.words
-    assert folder == str(run.path.resolve()) and starter and (every, trust) == (0.5, "sha")
+    ((folder, starter, every, trust, device),) = hands.words
+    assert folder == str(run.path.resolve()) and starter and (every, trust, device) == (0.5, "sha", "auto")
     assert sorted(hands.did) == ["closed"] * 2 + ["hired"] * 2 and not list((run.path / "workers").iterdir())
 
 
@@ -867,9 +907,9 @@ def test_a_hired_worker_answers_with_a_line(
         return {"done": 1}
 
     monkeypatch.setattr(rent, "work", work)
-    monkeypatch.setattr(rent.sys, "argv", ["-c", "/run", "s", "2.0", "sha"])
+    monkeypatch.setattr(rent.sys, "argv", ["-c", "/run", "s", "2.0", "sha", "cuda"])
     rent.hired()
-    assert seen == [("/run", {"starter": "s", "every": 2.0, "patience": 24.0, "trust": "sha"})]
+    assert seen == [("/run", {"starter": "s", "every": 2.0, "patience": 24.0, "trust": "sha", "device": "cuda"})]
     assert json.loads(capsys.readouterr().out) == ({"refused": "no room"} if fails else {"came": {"done": 1}})
 
 
@@ -885,7 +925,12 @@ def test_a_scheduler_of_others_is_used_and_left(tmp_path: Path, monkeypatch: pyt
     assert dask.did[0][0] == "needs"
     assert dask.did[1:3] == [("set", settings), ("client", "tcp://h:1", 30.0)]
     (_, f, words, more), (_, _, _, more2) = dask.did[3:5]
-    assert f is rent._work and words[0] == str(run.path.resolve()) and words[2:] == (0.5, "sha") and not more["pure"]
+    assert (
+        f is rent._work
+        and words[0] == str(run.path.resolve())
+        and words[2:] == (0.5, "sha", "auto")
+        and not more["pure"]
+    )
     assert more["key"] == f"fleet-{words[1]}-0" and more2["key"] == f"fleet-{words[1]}-1"
     assert dask.did[5:] == [("wait", 2, 1.0)] * 3 + ["client closed"]
     Dask(monkeypatch, [CancelledError()])

@@ -24,7 +24,11 @@ from hil.loop.heard_lanes import H_FRESH, H_P_S, H_SOURCE, N_HEARD, depth, stret
 from hil.loop.lockstep import Stimulus, lockstep
 from plant import Model, Plant, build_plant
 from vaneloop.base import extras
-from vaneloop.base.errors import InputError
+from vaneloop.base.errors import DeviceError, InputError
+from vaneloop.fleet import campaign, together
+from vaneloop.fleet.plan import files_of_plan, groups, load_plan, varied
+from vaneloop.fleet.together import no_gpu
+from vaneloop.fleet.worker import work
 
 HERE = Path(__file__).resolve().parent.parent
 # one by one on the processor, by the loop that the program compiles ahead
@@ -225,3 +229,122 @@ def test_ten_thousand_engines_on_a_gpu_are_those_in_lanes():
     some = [Model(effects={"lvdt_bias": {"bias": 1e-4 * i}}).plant(plant) for i, plant in enumerate(given)]
     for one, other in zip(on_gpu(DAY, some), margins_in_lanes(DAY, some, load_calibration(), heard(DAY)), strict=True):
         assert_same(one, other)
+
+
+# ---- campaigns -------------------------------------------------------------------------------------------------------
+
+PLAN = """title = "On a GPU"
+scenarios = ["day.toml"]
+samples = 8
+search = 0
+[vary]
+"sensors.vigv_bias" = "tolerance"
+"valve_null_bias.bias" = [-2.0, 2.0]
+"""
+STILL = """title = "Nothing moves"
+duration = 0.1
+expect = [{{ signal = "vigv", high = {high}, during = [0.05, 0.09] }}, {{ mode = "RUN", by = 0.08 }}]
+"""
+
+
+def plan(folder: Path) -> Path:
+    """A plan of one short scenario, which holds or not as the potentiometer's bias is."""
+    vigv = inject.run(Scenario(title="still", duration=0.1)).trace.signals["vigv"]
+    (folder / "day.toml").write_text(STILL.format(high=float(vigv[50:91].max())), encoding="utf-8")
+    (folder / "plan.toml").write_text(PLAN, encoding="utf-8")
+    return folder / "plan.toml"
+
+
+def command(file: Path, out: Path, *words: str, **env: str) -> tuple[int, str, dict[str, Any]]:
+    """`vaneloop campaign` in a process of its own: exit code, what it said, its JSON."""
+    code = "import sys; from vaneloop.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    answer = out.with_suffix(".json")
+    done = subprocess.run(
+        [sys.executable, "-c", code, "campaign", str(file), "--out", str(out), "--json", str(answer), *words],
+        cwd=HERE, env={**os.environ, "PYTHONPATH": str(HERE), **env}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    said = json.loads(answer.read_text(encoding="utf-8")) if answer.exists() else {}
+    return done.returncode, done.stdout + done.stderr, said
+
+
+SIMULATED = {"NUMBA_ENABLE_CUDASIM": "1"}
+
+
+@pytest.mark.slow
+def test_a_campaign_on_a_gpu_says_what_it_says_on_the_processor(tmp_path: Path) -> None:
+    if not extras.is_there("numba_cuda"):
+        pytest.skip("the extra gpu is not installed: the kernel has no simulator to run in")
+    file = plan(tmp_path)
+    code, said, gpu = command(file, tmp_path / "gpu", "--device", "cuda", **SIMULATED)
+    assert code in (0, 1), said
+    other, words, cpu = command(file, tmp_path / "cpu", "--device", "cpu")
+    assert code == other and "Simulated: 0.8 s on numba's simulator" in said
+    assert gpu["simulated_s"] == {"numba's simulator": pytest.approx(0.8)} and gpu["notes"] == cpu["notes"] == []
+    assert cpu["simulated_s"] == {"cpu": pytest.approx(0.8)} and "the processor (in lanes)" in words
+    (mine,), (theirs,) = gpu["groups"], cpu["groups"]
+    assert mine["alone"] == {} and mine["same"] and mine["failed"] == theirs["failed"] and 0 < mine["failed"] < 8
+    for one, same in zip(mine["requirements"], theirs["requirements"], strict=True):
+        assert (one["expected"], one["broken"], one["trials"]) == (same["expected"], same["broken"], same["trials"])
+        for of in ("least", "median"):
+            assert one[of] is same[of] is None or one[of] == pytest.approx(same[of], rel=1e-9)
+    file.write_text(file.read_text().replace('"day.toml"', '"day.toml", "babbling_idiot"'))
+    code, said, _ = command(file, tmp_path / "none", "--device", "cuda", **SIMULATED)
+    assert code == 2 and "babbling_idiot.shipped.shipped cannot run on a GPU: when frames come" in said
+    assert not (tmp_path / "none").exists() and len(said.splitlines()) == 1
+
+
+def test_without_a_gpu_cuda_is_one_line_and_a_later_command_goes_on(tmp_path: Path) -> None:
+    if not no_gpu():
+        pytest.skip("there is a GPU")
+    read, quantities, folder = campaign.begin(plan(tmp_path), tmp_path / "run", 3600.0)
+    assert campaign.take_samples(read, quantities, folder, 1) == 8 and len(folder.chunks()) == 1
+    with pytest.raises(DeviceError, match="^device 'cuda': "):
+        work(folder.path, device="cuda")
+    assert not folder.finished() and not list((folder.path / "leases").iterdir())
+    assert work(folder.path, device="auto") == {"done": 8}
+    view = campaign.judge(read, quantities, folder, lambda fraction: None)
+    assert view.simulated_s == {"cpu": pytest.approx(0.8)} and len(view.notes) == 1
+    assert view.notes[0].startswith("device 'auto': ") and view.notes[0].endswith("lanes ran 8 machines")
+    with pytest.raises(InputError, match="^device 'cuda': "):
+        campaign.has_gpu("cuda", True)
+    assert [campaign.has_gpu(*of) for of in (("auto", True), ("cpu", True), ("auto", False))] == [False] * 3
+    assert campaign.has_gpu("cuda", False), "workers elsewhere say themselves whether they have one"
+
+
+class Stopping:
+    """A GPU that runs three machines and then fails."""
+
+    name = "a GPU"
+
+    def release(self) -> None:
+        raise AssertionError("it is not used any more")
+
+
+@pytest.mark.parametrize("device", ["cuda", "auto"])
+def test_a_gpu_that_fails_amid_a_chunk_leaves_the_rest_to_the_processor_or_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str
+) -> None:
+    file = load_plan(plan(tmp_path))
+    files, (g,) = files_of_plan(file), groups(file)
+    quantities = varied(file, build_plant(), "plan")
+    points = np.random.default_rng(1).random((5, 2)).tolist()
+    alone = together.side_by_side(files, g, quantities, points)
+
+    def some(kernel: Any, scenario: Any, plants: list[Plant], calibration: Any, heard: Any) -> Any:
+        yield range(3), margins_in_lanes(scenario, plants[:3], calibration, heard)
+        raise RuntimeError("out of order")
+
+    monkeypatch.setattr(together, "_lost", [])
+    monkeypatch.setattr(together, "margins_on_gpu", some)
+    monkeypatch.setattr(cuda, "kernel", lambda watched: Stopping())
+    for first in (True, False):
+        if device == "cuda":
+            with pytest.raises(DeviceError, match="^device 'cuda': out of order$"):
+                together.side_by_side(files, g, quantities, points, device)
+            continue
+        found = together.side_by_side(files, g, quantities, points, device)
+        assert [(r.on, r.note) for r in found if isinstance(r, together.Ran)] == [
+            *[("a GPU", "") if first else ("cpu", "device 'auto': out of order")] * 3,
+            *[("cpu", "device 'auto': out of order")] * 2,
+        ]
+        assert [r.margins for r in found if isinstance(r, together.Ran)] == [a.margins for a in alone]  # type: ignore[union-attr]

@@ -413,6 +413,11 @@ class Kernel:
             raise MemoryError(f"{free / 2**20:.1f} MiB of its memory are free, {THREADS * each / 2**20:.1f} are needed")
         return int(fit)
 
+    def release(self) -> None:
+        """Give back the GPU's memory that nothing uses any more: others may be waiting for it."""
+        if not self.simulated:
+            self.cuda.current_context().deallocations.clear()
+
     def __call__(self, k0: int, ticks: int, noise: Any, machines: Machines, hears: Any, notes: Any) -> None:
         """Advance the engines; arguments as of `_run`, arrays those of the GPU."""
         engines = machines.s.shape[1]

@@ -3,11 +3,15 @@
 import difflib
 from collections.abc import Iterable
 
-__all__ = ["InputError", "meant"]
+__all__ = ["DeviceError", "InputError", "meant"]
 
 
 class InputError(ValueError):
     """Something from outside cannot be used. One line: the thing, its value, what is allowed."""
+
+
+class DeviceError(InputError):
+    """What was asked to run something, a GPU, cannot be used or has failed: no fault of what was to be run."""
 
 
 def meant(word: str, allowed: Iterable[str]) -> str:

@@ -6,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as Xml
 
+from hil.loop.engines import DEVICES
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
@@ -53,6 +54,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--limit", type=float, default=3600.0, metavar="S", help="s for one trial or one search")
     parser.add_argument("--patience", type=float, default=60.0, metavar="S", help="s without a heartbeat until another "
                         "worker takes over (default 60)")  # fmt: skip
+    parser.add_argument(
+        "--device", default="auto", choices=DEVICES, help="what runs the trials side by side: auto (default), the GPU "
+        "where there is one; cuda, the GPU; cpu, the processor",
+    )  # fmt: skip
     options.add_trust_option(parser, "the plan")
     terminal.add_output_options(parser, report=True)
     parser.add_argument("--junit", metavar="FILE", help="write JUnit XML: a suite a combination, a case a requirement")
@@ -75,8 +80,9 @@ def _command(args: argparse.Namespace) -> int:
     terminal.pairs(args.queue, "queue")
     own = [c.controller for c in load_plan(args.plan).firmware if c.controller]
     options.trusted(args, args.plan, own)
-    plan, quantities, folder = campaign.begin(args.plan, args.out, args.limit)
-    new = campaign.take_samples(plan, quantities, folder)
+    gpu = campaign.has_gpu(args.device, args.on == "local")
+    plan, quantities, folder = campaign.begin(args.plan, args.out, args.limit, args.device)
+    new = campaign.take_samples(plan, quantities, folder, args.workers if gpu else 0)
     terminal.say(args, f"{new} trials to take up")
     _work(args, folder, "running the trials")
     new = campaign.take_searches(plan, folder)
@@ -104,7 +110,8 @@ def _work(args: argparse.Namespace, folder: object, what: str) -> None:
         return
     with terminal.progress_bar(args, what) as progress:
         rent(folder, args.on, args.workers, terminal.pairs(args.queue, "queue"), args.patience / BEATS,
-             lambda n, of: progress(n / max(of, 1)) if progress else None, folder.job["machine"])  # fmt: skip
+             lambda n, of: progress(n / max(of, 1)) if progress else None, folder.job["machine"],
+             args.device)  # fmt: skip
 
 
 def _show(args: argparse.Namespace, view: CampaignView, search: int) -> None:
@@ -136,6 +143,10 @@ def _show(args: argparse.Namespace, view: CampaignView, search: int) -> None:
         for f in g.failures:
             if not f.same:
                 terminal.say(args, f"does NOT reproduce: {f.command}")
+    if view.simulated_s:
+        terminal.say(args, view.simulated_on)
+    for note in view.notes:
+        terminal.say(args, note)
     terminal.say(args, view.sentence())
 
 

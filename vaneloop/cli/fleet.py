@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from hil.loop.engines import DEVICES
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.base.extras import needs
@@ -77,6 +78,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     for part in (work, status, report):
         part.add_argument("run", metavar="RUN", help="folder of the run")
     _add_patience(work)
+    work.add_argument(
+        "--device", default="auto", choices=DEVICES, help="what runs a campaign's trials (docs/campaigns.md)"
+    )
     options.add_trust_option(work, "the run's folder")
     report.add_argument("--limits", metavar="F.csv", help="columns quantity, limit: where an effect's parameter or a "
                         "nominal one ends its life; of a nominal one without, the end of its tolerance")  # fmt: skip
@@ -170,7 +174,8 @@ def _known_machine(args: argparse.Namespace) -> None:
 def _work(args: argparse.Namespace) -> int:
     patience, folder = _patience(args), Folder(args.run)
     options.trusted(args, str(folder.path), folder.code())
-    came = work(args.run, every=patience / BEATS, patience=patience, trust=folder.job["machine"])
+    came = work(args.run, every=patience / BEATS, patience=patience, trust=folder.job["machine"],
+                device=args.device)  # fmt: skip
     terminal.say(args, "this worker: " + (", ".join(f"{n} {s}" for s, n in sorted(came.items())) or "nothing to do"))
     return _show(args)
 

@@ -34,16 +34,31 @@ from vaneloop.fleet.plan import Group, Plan, Varied
 from vaneloop.fleet.probability import SHARE, Level, Subset, interval
 from vaneloop.fleet.sources import Source
 from vaneloop.fleet.tables import answers
+from vaneloop.fleet.together import CPU, demand_gpu, no_gpu
 from vaneloop.fleet.trial import is_answer, model_at, moving, trial_once, worst_share
 from vaneloop.pages.campaign import CampaignView, FailedMachine, GroupView, Rare, Requirement
 
-__all__ = ["begin", "interval", "judge", "take_samples", "take_searches"]
+__all__ = ["begin", "has_gpu", "interval", "judge", "take_samples", "take_searches"]
 
 KNOWN = 64  # worst samples that a search begins with
+ON_GPU = 1024  # samples in a chunk: a GPU takes hardly longer for them than for one
 
 
-def begin(file: str | Path, out: str | Path, limit: float) -> tuple[Plan, list[Varied], Folder]:
-    """Read the plan, check it against the machine, and begin the run or open it. Raises InputError."""
+def has_gpu(device: str, here: bool) -> bool:
+    """Whether samples will run on a GPU, as far as that is known before anything is begun; ``here``: on this computer.
+    Raises InputError where they must, and cannot.
+    """
+    if device == CPU or not here:
+        return device == "cuda"
+    if (why := no_gpu()) and device == "cuda":
+        raise InputError(f"device 'cuda': {why}")
+    return not why
+
+
+def begin(file: str | Path, out: str | Path, limit: float, device: str = "auto") -> tuple[Plan, list[Varied], Folder]:
+    """Read the plan, check it against the machine, and begin the run or open it. Raises InputError; with ``device``
+    "cuda" also for a scenario that no GPU can run.
+    """
     plan = plans.load_plan(file)
     files = plans.files_of_plan(plan)
     quantities: list[Varied] = []
@@ -52,6 +67,8 @@ def begin(file: str | Path, out: str | Path, limit: float) -> tuple[Plan, list[V
         quantities = plans.varied(plan, machine.plant, file)
         for corner in (0.0, 1.0):  # limits that a model file may not have are refused before anything is begun
             plans.group_machine(files, g, model_at(files, g, quantities, [corner] * len(quantities)))
+    if device == "cuda":
+        demand_gpu(files, plans.groups(plan), quantities)
     told = plan.model_dump(mode="json", exclude={"title", "confidence", "allowed", "saved"})
     for c in (
         told["calibration"] + told["firmware"]
@@ -62,8 +79,11 @@ def begin(file: str | Path, out: str | Path, limit: float) -> tuple[Plan, list[V
     return plan, quantities, Folder.begin(out, TRIAL, options, files)
 
 
-def take_samples(plan: Plan, quantities: list[Varied], folder: Folder) -> int:
-    """Take up every sample, and every point of the sensitivity indices; return how many are new."""
+def take_samples(plan: Plan, quantities: list[Varied], folder: Folder, gpus: int = 0) -> int:
+    """Take up every sample, and every point of the sensitivity indices; return how many are new.
+
+    gpus  workers that have a GPU, whose chunks are larger
+    """
     a, b = plans.draw(plan, len(quantities))
     trials: list[str] = []
     for g in plans.groups(plan):
@@ -73,7 +93,8 @@ def take_samples(plan: Plan, quantities: list[Varied], folder: Folder) -> int:
             mixed[:, k] = b[:, k]
             points |= {f"ab{k:03d}-{i:06d}": x for i, x in enumerate(mixed)}
         trials += [_trial(folder, g, name, {"point": x.tolist()}) for name, x in points.items()]
-    return folder.add([Source(t, "campaign", 0.0) for t in trials])
+    in_chunk = min(-(-len(trials) // gpus), ON_GPU) if gpus else None
+    return folder.add([Source(t, "campaign", 0.0) for t in trials], in_chunk)
 
 
 def take_searches(plan: Plan, folder: Folder) -> int:
@@ -127,6 +148,8 @@ def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[
     """What the campaign says. The worst case of each group is saved, and run again from its saved files."""
     files = {n: str(folder.path / f) for n, f in folder.job["options"]["files"].items()}
     shown, all_groups = [], list(plans.groups(plan))
+    simulated: Counter[str] = Counter()
+    notes: Counter[str] = Counter()
     for k, g in enumerate(all_groups):
         rows = _rows(folder, g)
         done = [r for r in rows.values() if r is not None]
@@ -137,6 +160,11 @@ def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[
         levels = _rows(folder, g, "subset.json").get("subset")
         beyond = [r for r in (search, levels) if r]
         worst = min([*done, *beyond], key=lambda r: (worst_share(r, among), r["point"]))
+        duration = plans.scenario_of(files, g).duration
+        for r in (*done, *(b for b in _rows(folder, g, "[ab]*.json").values() if b), *beyond):
+            simulated.update({on: n * duration for on, n in r.get("ran", {}).items()})
+            if r.get("note"):
+                notes[r["note"]] += r.get("ran", {}).get(CPU, 0)
         nearest = min(beyond, key=lambda r: worst_share(r, among), default=None)
         rare = _rare(levels, plan.confidence, worst is levels)
         failed = sum(not r["held"] for r in done)
@@ -163,7 +191,8 @@ def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[
         told((k + 1) / len(all_groups))
     return CampaignView(
         plan.title, str(folder.path), folder.job["version"], [vars(q) for q in quantities], plan.confidence,
-        plan.allowed, plan.sampling, plan.seed, shown,
+        plan.allowed, plan.sampling, plan.seed, shown, dict(simulated),
+        [f"{why}; the processor's lanes ran {n:,} machines" for why, n in notes.items()],
     )  # fmt: skip
 
 

@@ -60,7 +60,8 @@ class Kind:
 
     function  module and name; called with an entry's path, the options and the run's folder; returns what JSON holds
     options   what run.json may tell it
-    together  whether it is quicker with many entries at once: it is called with the paths of those to come, too
+    together  whether it is quicker with many entries at once: it is called with the paths of those to come, too, and
+              with the device that is to run them
     """
 
     function: tuple[str, str]

@@ -28,10 +28,10 @@ from numba import config
 from vaneloop.base import terminal
 from vaneloop.base.child import python
 from vaneloop.base.compiled import cache_folder, sources_digest
-from vaneloop.base.errors import InputError
+from vaneloop.base.errors import DeviceError, InputError
 from vaneloop.fleet.kinds import KINDS
 
-__all__ = ["Died", "NotReady", "Reader", "Stopped", "TimedOut", "serve"]
+__all__ = ["DEVICE", "Died", "NotReady", "Reader", "Stopped", "TimedOut", "serve"]
 
 SERVE = "from vaneloop.fleet.reader import serve; serve()"
 
@@ -41,6 +41,7 @@ ONE_THREAD = dict.fromkeys(
 )
 
 WARM_UP = 1200.0  # s for compiling on the slowest of machines
+DEVICE = "device"  # status of an answer that says why the device cannot be used
 STARTS = 3  # of a process that ends before it has read anything
 
 
@@ -63,19 +64,22 @@ class NotReady(InputError):
 class Reader:
     """A worker's process for logs, begun when it is first needed and after it has died."""
 
-    def __init__(self, kind: str, folder: str, stopped: threading.Event):
-        """``kind``: one of `KINDS`: what is done with each log."""
-        self.kind, self.folder, self.stopped = kind, folder, stopped
+    def __init__(self, kind: str, folder: str, stopped: threading.Event, device: str = "cpu"):
+        """``kind``: one of `KINDS`: what is done with each log; ``device``: what runs it (`hil.loop.engines`)."""
+        self.kind, self.folder, self.stopped, self.device = kind, folder, stopped, device
         self.process: subprocess.Popen[bytes] | None = None
 
-    def ask(self, path: str, options: dict[str, Any], limit: float, beside: Sequence[str] = ()) -> dict[str, Any]:
-        """What the function says of a log; ``beside``: what will be asked for next. Raises Died, TimedOut (after
-        ``limit`` s), Stopped, NotReady, or OSError.
+    def ask(
+        self, path: str, options: dict[str, Any], limit: float, beside: Sequence[str] = (), device: str = ""
+    ) -> dict[str, Any]:
+        """What the function says of a log; ``beside``: what will be asked for next; ``device``: in place of the
+        process's own. Raises Died, TimedOut (after ``limit`` s), Stopped, NotReady, DeviceError, or OSError.
         """
         try:
             if self.process is None:
                 self._ready(options)
-            return self._answer({"path": path, "options": options, "beside": list(beside)}, limit)
+            asked = {"path": path, "options": options, "beside": list(beside), "device": device or self.device}
+            return self._answer(asked, limit)
         except BrokenPipeError:
             raise Died(f"the process that read it ended with {self._ended()}") from None
         except (Stopped, TimedOut):
@@ -114,7 +118,7 @@ class Reader:
             python(SERVE, self.kind, self.folder), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
             env=_environment(),
         )  # fmt: skip
-        self._answer({"options": options}, WARM_UP)
+        self._answer({"options": options, "device": self.device}, WARM_UP)
 
     def _answer(self, question: dict[str, Any], limit: float) -> dict[str, Any]:
         assert self.process is not None and self.process.stdin is not None and self.process.stdout is not None
@@ -131,7 +135,10 @@ class Reader:
                 raise Stopped
             elif time.monotonic() > until:
                 raise TimedOut(f"no answer in {limit:g} s")
-        return dict(json.loads(answer))
+        said = dict(json.loads(answer))
+        if said.get("status") == DEVICE:
+            raise DeviceError(said["reason"])
+        return said
 
     def stop(self) -> None:
         """End the process."""
@@ -170,12 +177,16 @@ def serve() -> None:
         asked = json.loads(line)
         try:
             if "path" in asked:
-                more = [asked["beside"]] if KINDS[sys.argv[1]].together else []
+                more = [asked["beside"], asked["device"]] if KINDS[sys.argv[1]].together else []
                 said = function(asked["path"], asked["options"], sys.argv[2], *more)
                 answer = {"status": "done", "reason": "", **said}
             else:
                 _warm_up(getattr(function, "warm_up", None), asked["options"], sys.argv[2])
+                if (compile_for := getattr(function, "warm_up_device", None)) is not None:
+                    compile_for(asked["device"])
                 answer = {}
+        except DeviceError as e:
+            answer = {"status": DEVICE, "reason": str(e)}
         except InputError as e:
             answer = {"status": "refused", "reason": str(e)}
         except Exception as e:

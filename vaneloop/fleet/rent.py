@@ -46,7 +46,7 @@ def known(on: str) -> None:
 
 def rent(
     folder: Folder, on: str, workers: int, queue: dict[str, str], every: float, told: Callable[[int, int], None],
-    trust: str = "",
+    trust: str = "", device: str = "auto",
 ) -> dict[str, int]:  # fmt: skip
     """Have ``workers`` processes work on the run until it is done; return how many logs came to what.
 
@@ -54,13 +54,13 @@ def rent(
     queue  options of the Slurm queue (dask-jobqueue's SLURMCluster): queue, account, walltime, memory ...
     every  s between heartbeats
     told   function that takes chunks done and all, called every second
-    trust  as `vaneloop.fleet.worker.work` takes it
-    Raises InputError where the place cannot be reached, or a worker cannot go on (a full disk).
+    trust, device  as `vaneloop.fleet.worker.work` takes them
+    Raises InputError where the place cannot be reached, or a worker cannot go on (a full disk, a GPU that fails).
     """
     known(on)
     starter = Me(folder.path, every, kind="starter")
     try:
-        words = (str(folder.path.resolve()), starter.name, every, trust)
+        words = (str(folder.path.resolve()), starter.name, every, trust, device)
         all_chunks = len(folder.chunks())
         step = lambda: told(len(folder.finished()), all_chunks)  # noqa: E731
         counts = _hire(folder, workers, words, step) if on == "local" else _dask(on, workers, queue, words, step)
@@ -145,11 +145,11 @@ def _hire(folder: Folder, workers: int, words: tuple[Any, ...], step: Callable[[
 
 def hired() -> None:
     """Work on a run as a process of `_hire`, and answer with a line. The words: run, starter, s between heartbeats,
-    trust.
+    trust, device.
     """
-    run, starter, every, trust = sys.argv[1:5]
+    run, starter, every, trust, device = sys.argv[1:6]
     try:
-        said: dict[str, Any] = {"came": _work(run, starter, float(every), trust)}
+        said: dict[str, Any] = {"came": _work(run, starter, float(every), trust, device)}
     except InputError as e:
         said = {"refused": str(e)}
     print(json.dumps(said), flush=True)
@@ -213,6 +213,6 @@ def _cluster(on: str, workers: int, queue: dict[str, str], run: str) -> Any:
     return cluster
 
 
-def _work(run: str, starter: str, every: float, trust: str) -> dict[str, int]:
+def _work(run: str, starter: str, every: float, trust: str, device: str) -> dict[str, int]:
     """Work on the run, in a process of the cluster."""
-    return work(run, starter=starter, every=every, patience=BEATS * every, trust=trust)
+    return work(run, starter=starter, every=every, patience=BEATS * every, trust=trust, device=device)

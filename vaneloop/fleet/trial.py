@@ -9,6 +9,7 @@ their margins). The levels of a subset simulation have ``subset`` (true), ``amon
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -31,25 +32,29 @@ from vaneloop.base.tables import Finite, Table
 from vaneloop.fleet.files import read_json
 from vaneloop.fleet.plan import Group, Varied, base_model, group_machine, model_of, scenario_of, values_at
 from vaneloop.fleet.probability import subset
-from vaneloop.fleet.together import Alone, in_lanes
+from vaneloop.fleet.together import BUS, CPU, Alone, Ran, side_by_side, warm_up_gpu
 
 __all__ = ["is_answer", "model_at", "moving", "run_trial", "trial_once", "worst_share"]
 
 
-def run_trial(path: str, options: dict[str, Any], run_folder: str, beside: Sequence[str] = ()) -> dict[str, Any]:
+def run_trial(
+    path: str, options: dict[str, Any], run_folder: str, beside: Sequence[str] = (), device: str = CPU
+) -> dict[str, Any]:
     """Do what the file asks for; the answer has the point, the margins and the state's digest of the (worst) run.
 
-    beside  files of trials that will be asked for next: those of the same group run in lanes with this one, and their
-            answers are kept until then
+    beside  files of trials that will be asked for next: those of the same group run side by side with this one, and
+            their answers are kept until then
+    device  what runs trials side by side: "cpu", "cuda" or "auto". Raises DeviceError where "cuda" cannot be used
     """
     asked = _asked(path)
     files = {name: str(Path(run_folder) / f) for name, f in options["files"].items()}
     g, quantities = Group(*asked["group"]), [Varied(**q) for q in options["vary"]]
     if _is_sample(asked):
-        answer = _sample(files, g, quantities, asked, beside)
+        answer = _sample(files, g, quantities, asked, beside, device)
+    elif asked.get("subset"):
+        answer = _subset(files, g, quantities, asked, int(options["seed"]), device)
     else:
-        of = _subset if asked.get("subset") else _search
-        answer = of(files, g, quantities, asked, int(options["seed"]))
+        answer = _search(files, g, quantities, asked, int(options["seed"]))
     return {"verdict": "held" if answer["held"] else "failed", "answer": answer}
 
 
@@ -61,9 +66,9 @@ _kept: dict[str, dict[str, Any]] = {}  # answers that will be asked for: by what
 
 
 def _sample(
-    files: dict[str, str], g: Group, quantities: list[Varied], asked: dict[str, Any], beside: Sequence[str]
+    files: dict[str, str], g: Group, quantities: list[Varied], asked: dict[str, Any], beside: Sequence[str], device: str
 ) -> dict[str, Any]:
-    """The answer to a sample: from lanes, where they can run it."""
+    """The answer to a sample: side by side with others, where it can be."""
     key = json.dumps([files, asked], sort_keys=True)
     if key not in _kept:
         _kept.clear()
@@ -73,19 +78,24 @@ def _sample(
                 next_one = _asked(other)
                 if next_one["group"] == asked["group"] and _is_sample(next_one):
                     all_asked[json.dumps([files, next_one], sort_keys=True)] = next_one
-        found = in_lanes(files, g, quantities, [a["point"] for a in all_asked.values()])
-        for name, one, margins in zip(all_asked, all_asked.values(), found, strict=True):
-            _kept[name] = {"alone": margins.why} if isinstance(margins, Alone) else _in_lanes(margins, one["point"])
+        found = side_by_side(files, g, quantities, [a["point"] for a in all_asked.values()], device)
+        for name, one, ran in zip(all_asked, all_asked.values(), found, strict=True):
+            _kept[name] = {"alone": ran.why} if isinstance(ran, Alone) else _beside_others(ran, one["point"])
     answer = _kept.pop(key)
     if answer["alone"]:
-        return {**trial_once(files, g, quantities, asked["point"]), **answer}
+        return {**trial_once(files, g, quantities, asked["point"]), **answer, "ran": {BUS: 1}}
     return answer
 
 
-def _in_lanes(margins: list[Margin], point: list[float]) -> dict[str, Any]:
-    """The answer of a machine that ran in lanes: it has no digest, and nothing was seen but its margins."""
-    held = all(m.held for m in margins)
-    return {"point": point, "held": held, "margins": _rows(margins), "state_hash": None, "seen": [], "alone": ""}
+def _beside_others(ran: Ran, point: list[float]) -> dict[str, Any]:
+    """The answer of a machine that ran side by side with others: it has no digest, and nothing was seen but its
+    margins.
+    """
+    held = all(m.held for m in ran.margins)
+    return {
+        "point": point, "held": held, "margins": _rows(ran.margins), "state_hash": None, "seen": [], "alone": "",
+        "ran": {ran.on: 1}, "note": ran.note,
+    }  # fmt: skip
 
 
 class _Margin(BaseModel):
@@ -112,10 +122,12 @@ class _Answer(BaseModel):
     point: list[Finite]
     held: bool
     margins: list[_Margin]
-    state_hash: str | None  # None: the controller did not run to the end, or it ran in lanes
+    state_hash: str | None  # None: the controller did not run to the end, or it ran side by side with others
     seen: list[str]
     runs: int = 0
-    alone: str | None = None  # why it did not run in lanes; empty: it did
+    alone: str | None = None  # why it did not run side by side with others; empty: it did
+    ran: dict[str, Annotated[int, Field(ge=0)]] = {}  # runs by what ran them: a GPU's name, "cpu", "bus"
+    note: str = ""  # why a GPU that was asked for ran none, or not all
     subset: _Subset | None = None
 
 
@@ -258,24 +270,28 @@ def _search(
     except _Spent:
         pass
     answer = best[1] if best[0] < seen[start[0]] else trial_once(files, g, quantities, list(start[0]))
-    return {**answer, "runs": runs, "from": seen[start[0]]}
+    return {**answer, "runs": runs, "from": seen[start[0]], "ran": {BUS: runs}}
 
 
 def _subset(
-    files: dict[str, str], g: Group, quantities: list[Varied], asked: dict[str, Any], seed: int
+    files: dict[str, str], g: Group, quantities: list[Varied], asked: dict[str, Any], seed: int, device: str
 ) -> dict[str, Any]:
-    """Run level after level from the samples that are known, side by side in lanes where they can; answer with the
-    machine of the least margin. The same file gives the same runs.
+    """Run level after level from the samples that are known, side by side where they can; answer with the machine of
+    the least margin. The same file gives the same runs.
     """
     points, shares = (list(of) for of in zip(*asked["known"], strict=True))
     start = min(zip(shares, points, strict=True))
     best: list[Any] = [start[0], None]
+    count: Counter[str] = Counter()
+    notes: list[str] = []
 
     def least(x: np.ndarray) -> np.ndarray:
         of = x.tolist()
-        found = in_lanes(files, g, quantities, of)
-        answers = [trial_once(files, g, quantities, point) if isinstance(margins, Alone) else _in_lanes(margins, point)
-                   for margins, point in zip(found, of, strict=True)]  # fmt: skip
+        found = side_by_side(files, g, quantities, of, device)
+        count.update(BUS if isinstance(ran, Alone) else ran.on for ran in found)
+        notes.extend({ran.note for ran in found if isinstance(ran, Ran) and ran.note})
+        answers = [trial_once(files, g, quantities, point) if isinstance(ran, Alone) else _beside_others(ran, point)
+                   for ran, point in zip(found, of, strict=True)]  # fmt: skip
         out = [worst_share(answer, asked["among"]) for answer in answers]
         k = int(np.argmin(out))
         if out[k] < best[0]:
@@ -285,7 +301,8 @@ def _subset(
     found = subset(least, np.array(points), np.array(shares), seed)
     answer = best[1] or trial_once(files, g, quantities, start[1])
     levels = [(level.margin, level.share, level.variation) for level in found.levels]
-    return {**answer, "subset": {"levels": levels, "reached": found.reached, "runs": found.runs}}
+    said = {"levels": levels, "reached": found.reached, "runs": found.runs}
+    return {**answer, "subset": said, "ran": dict(count), "note": notes[0] if notes else ""}
 
 
 def _warm_up(options: dict[str, Any], run_folder: str) -> None:
@@ -296,3 +313,4 @@ def _warm_up(options: dict[str, Any], run_folder: str) -> None:
 
 
 run_trial.warm_up = _warm_up  # type: ignore[attr-defined]
+run_trial.warm_up_device = warm_up_gpu  # type: ignore[attr-defined]

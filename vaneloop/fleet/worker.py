@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from vaneloop.base.errors import InputError
+from vaneloop.base.errors import DeviceError, InputError
 from vaneloop.fleet.files import passed, plain_bytes, whole_json
 from vaneloop.fleet.folder import Entry, Folder, key_of, sources_version
 from vaneloop.fleet.journal import Journal
-from vaneloop.fleet.kinds import checked
+from vaneloop.fleet.kinds import KINDS, checked
 from vaneloop.fleet.leases import Leases, Me
-from vaneloop.fleet.reader import Died, Reader, Stopped, TimedOut
+from vaneloop.fleet.reader import DEVICE, Died, Reader, Stopped, TimedOut
 
 __all__ = ["work"]
 
@@ -26,7 +26,7 @@ TRIES = 12  # begun and never ended, also by the death of the whole worker
 
 def work(
     run: str | Path, *, starter: str = "", every: float = 5.0, patience: float = 60.0, wait: bool = True,
-    trust: str = "",
+    trust: str = "", device: str = "auto",
 ) -> dict[str, int]:  # fmt: skip
     """Work on a run until nothing is left to do; return how many logs came to what.
 
@@ -35,8 +35,9 @@ def work(
     patience  s without a heartbeat, after which another worker's chunk is taken over
     wait      stay until others have done theirs, and take over what they leave
     trust     SHA-256 of the machine (run.json) whose code may be run: a model of the user's own, controllers
+    device    what runs a campaign's trials side by side: "auto", "cpu" or "cuda" (docs/campaigns.md)
     Raises InputError where this VaneLoop is not the run's, its code is not trusted, its machine is damaged, or the disk
-    is full: what is done is done.
+    is full, DeviceError where the device cannot be used or fails: what is done is done.
     """
     folder = Folder(run)
     if folder.job["version"] != sources_version():
@@ -55,7 +56,7 @@ def work(
         folder.machine()
         me = Me(folder.path, every, starter)
         with _terminable(me):
-            return _Worker(folder, me, Leases(folder.path, patience), limit).run(wait)
+            return _Worker(folder, me, Leases(folder.path, patience), limit, device).run(wait)
     except OSError as e:
         raise InputError(f"{folder.path}: {_short(e)}; what is done is kept, run the same command again") from None
     finally:
@@ -64,9 +65,9 @@ def work(
 
 
 class _Worker:
-    def __init__(self, folder: Folder, me: Me, leases: Leases, limit: float = 3600.0):
-        self.folder, self.me, self.leases, self.limit = folder, me, leases, limit
-        self.reader = Reader(folder.job["kind"], str(folder.path), me.stopped)
+    def __init__(self, folder: Folder, me: Me, leases: Leases, limit: float = 3600.0, device: str = "cpu"):
+        self.folder, self.me, self.leases, self.limit, self.device = folder, me, leases, limit, device
+        self.reader = Reader(folder.job["kind"], str(folder.path), me.stopped, device)
         self.counts: dict[str, int] = {}
         self.journal = Journal(folder.path, me.name)
 
@@ -119,7 +120,7 @@ class _Worker:
         row: dict[str, Any] | None = None
         while row is None:
             try:
-                before = _lines(tried)
+                before = _tries(tried)
             except OSError:  # no plain file
                 self.folder.set_aside(tried)
                 before = []
@@ -138,18 +139,29 @@ class _Worker:
         self.journal.note("end", key=e.key, status=row["status"])
 
     def _read(self, e: Entry, tried: Path, before: Sequence[str], beside: Sequence[str]) -> dict[str, Any] | None:
-        """What comes of a log now; None: to be tried again. After a failure it is tried without those ``beside``."""
+        """What comes of a log now; None: to be tried again. After a failure it is tried without those ``beside``, and
+        with "auto" on the processor.
+        """
         if (bad := _unlike(e)) is not None:
             return bad
+        together = bool(beside) and KINDS[self.folder.job["kind"]].together and not before
+        device = "cpu" if before and self.device == "auto" else ""
         try:
-            row = self.reader.ask(e.path, self.folder.job["options"], self.limit, () if before else beside)
+            row = self.reader.ask(e.path, self.folder.job["options"], self.limit, () if before else beside, device)
         except Stopped:
             return None
+        except DeviceError as why:
+            self.journal.note("device", key=e.key, reason=str(why))
+            _append(tried, DEVICE)
+            raise
         except Died as why:
             self.journal.note("died", key=e.key, reason=str(why))
             _append(tried, f"died {why}")
             return None
         except TimedOut as why:
+            if together:  # the time is one log's
+                _append(tried, f"late {why}")
+                return None
             return {"status": "timeout", "reason": str(why)}
         if (bad := _unlike(e)) is not None:
             return bad
@@ -181,6 +193,17 @@ def _unlike(e: Entry) -> dict[str, Any] | None:
         return {"status": "unreadable", "reason": f"cannot be read ({why.strerror})"}
     reason = "its content has changed since the run took it up; vaneloop fleet run takes it up anew"
     return {"status": "changed", "reason": reason}
+
+
+def _tries(file: Path) -> list[str]:
+    """What a log's file says of how it was tried, without tries that a device broke off."""
+    out: list[str] = []
+    for line in _lines(file):
+        if line == DEVICE:
+            del out[-1:]
+        else:
+            out.append(line)
+    return out
 
 
 def _lines(file: Path) -> list[str]:

@@ -153,7 +153,11 @@ class GroupView:
 
 @dataclass(frozen=True)
 class CampaignView:
-    """What a campaign says: its groups, and what was varied (name, unit, low, high)."""
+    """What a campaign says: its groups, and what was varied (name, unit, low, high).
+
+    simulated_s  s of samples, indices, levels and search by what ran them: a GPU's name, "cpu" (lanes), "bus"
+    notes        what ran elsewhere than it was asked to, and why
+    """
 
     title: str
     run: str
@@ -164,6 +168,14 @@ class CampaignView:
     sampling: str
     seed: int
     groups: list[GroupView]
+    simulated_s: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def simulated_on(self) -> str:
+        """How many seconds were simulated on what, in words."""
+        names = {"cpu": "the processor (in lanes)", "bus": "the lockstep bus (one by one)"}
+        return "Simulated: " + ", ".join(f"{s:,.6g} s on {names.get(on, on)}" for on, s in self.simulated_s.items())
 
     def passed(self, g: GroupView) -> bool:
         """Whether a group is good: no trial lost and all that is saved reproduced; and either nothing broken, or the
@@ -223,6 +235,8 @@ def campaign_page(view: CampaignView, command: str = "") -> Page:
     for g in view.groups:
         _group(page, view, g)
     page.section("Basis")
+    if view.simulated_s:
+        page.text(f"{view.simulated_on}. {''.join(f'{note}. ' for note in view.notes)}")
     page.text(f"VaneLoop {view.version}. All trials, their answers and the copies of all files are in {view.run}.")
     return page
 
