@@ -2,7 +2,7 @@
 
 Each row is printed, and the file written anew, when it is measured. Ratios are against lanes on all of the processor's
 cores (`hil.loop.lanes`) in the same run: of whole calls, and of the loops alone. First 10,000 engines of many kinds are
-compared, figure by figure.
+compared, figure by figure. Then the same of scenarios, as a campaign runs them: verdicts and margins are compared.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import json
 import sys
 import time
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,12 @@ import numpy as np
 
 from benchmarks.ours import OurLanes, Setup
 from controller import load_calibration
-from hil.loop.cuda import kernel
+from hil.inject import load_scenario
+from hil.inject.heard import Heard, hear
+from hil.inject.in_lanes import WATCHED, margins_in_lanes, margins_on_gpu
+from hil.inject.margin import Margin
+from hil.inject.scenario import Scenario
+from hil.loop.cuda import Kernel, kernel
 from hil.loop.engines import Engines, lockstep_engines, put_on_gpu
 from hil.loop.lockstep import CHUNK, S_FRESH, S_P_S, WARM_UP, Stimulus
 from plant import Model, Plant, build_plant
@@ -30,6 +36,7 @@ COMPARED = 10_000
 SIZES = (1_000, 10_000, 33_792, 100_000)
 LONG, SHORT = 60.0, 10.0  # s
 ON_PROCESSOR = 4096  # engines
+SCENARIOS = ("demand_gap_200ms", "lvdt_jumps", "bad_day")  # frames that are missing; a machine that changes; long
 RESULT = Path(__file__).parent / "results" / "gpu.json"
 
 
@@ -149,12 +156,89 @@ def kernel_alone(plants: list[Plant], seconds: float) -> float:
     return n * seconds / (time.perf_counter() - started)
 
 
+class Timed:
+    """A kernel that notes how long its launches take, s."""
+
+    def __init__(self, of: Kernel):
+        self.of, self.s = of, 0.0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.of, name)
+
+    def __call__(self, *arguments: Any) -> None:
+        self.of.cuda.synchronize()  # what was put there before
+        started = time.perf_counter()
+        self.of(*arguments)
+        self.of.cuda.synchronize()
+        self.s += time.perf_counter() - started
+
+
+def on_gpu(k: Any, scenario: Scenario, plants: list[Plant], heard: Heard) -> list[list[Margin]]:
+    """Margins of machines on the GPU."""
+    found = margins_on_gpu(k, scenario, plants, load_calibration(), heard)
+    return [margins for _, some in found for margins in some]
+
+
+def in_lanes(scenario: Scenario, plants: list[Plant], heard: Heard) -> list[list[Margin]]:
+    """Margins of machines in lanes on all cores."""
+    out: dict[int, list[list[Margin]]] = {}
+
+    def run(part: range) -> None:
+        some = plants[part.start : part.stop]
+        out[part.start] = margins_in_lanes(scenario, some, load_calibration(), heard)
+
+    on_all_cores(run, [range(a, min(a + W, len(plants))) for a in range(0, len(plants), W)])
+    return [margins for a in sorted(out) for margins in out[a]]
+
+
+def apart(a: list[list[Margin]], b: list[list[Margin]]) -> dict[str, Any]:
+    """How far margins are from each other: machines whose verdicts differ, largest relative difference."""
+    verdicts = sum([m.held for m in one] != [m.held for m in other] for one, other in zip(a, b, strict=True))
+    x, y = (np.array([m.value for one in of for m in one]) for of in (a, b))
+    far = np.abs(x - y) / np.maximum(np.abs(y), 1e-12)
+    return {
+        "verdicts, machines that differ": verdicts, "margins, relative": float(np.nanmax(far)),
+        "margins that only one has": int((np.isnan(x) != np.isnan(y)).sum()),
+        "failed": sum(not all(m.held for m in one) for one in b),
+    }  # fmt: skip
+
+
+def measure_scenarios(
+    names: tuple[str, ...] = SCENARIOS, sizes: tuple[int, ...] = SIZES, compared: int = COMPARED
+) -> Iterator[dict[str, Any]]:
+    """Measure scenarios; a row at a time."""
+    plants, affected = within_tolerance(max(*sizes, compared)), with_effects(compared // 2)
+    mixed = [plant for pair in zip(plants, affected, strict=False) for plant in pair][:compared]
+    for name in names:
+        scenario = load_scenario(name)
+        heard = hear(scenario, plants[0])
+        assert isinstance(heard, Heard)
+        started = time.perf_counter()
+        on_gpu(kernel(WATCHED), scenario, [plants[0], affected[0]], heard)
+        yield {"what": f"{name}: kernel compiled", "device": kernel(WATCHED).name, "s": time.perf_counter() - started}
+        in_lanes(scenario, [plants[0], affected[0]], heard)
+        started = time.perf_counter()
+        lanes = in_lanes(scenario, mixed, heard)
+        rate = len(mixed) * scenario.duration / (time.perf_counter() - started)
+        yield {"what": f"{name}: in lanes", "threads": threads(), "machines": len(mixed), "whole calls, s/s": rate}
+        yield {"what": f"{name}: cuda against cpu", **apart(on_gpu(kernel(WATCHED), scenario, mixed, heard), lanes)}
+        for count in sizes:
+            timed = Timed(kernel(WATCHED))
+            started = time.perf_counter()
+            on_gpu(timed, scenario, plants[:count], heard)
+            s, simulated = time.perf_counter() - started, count * scenario.duration
+            yield {
+                "what": name, "device": timed.name, "machines": count, "simulated s": simulated, "whole call, s": s,
+                "whole call, s/s": simulated / s, "ratio": simulated / s / rate, "kernel, s/s": simulated / timed.s,
+            }  # fmt: skip
+
+
 def main() -> None:
     """Measure and tell."""
     file = Path(sys.argv[1]) if len(sys.argv) > 1 else RESULT
     file.parent.mkdir(parents=True, exist_ok=True)
     rows = []
-    for row in measure():
+    for row in chain(measure(), measure_scenarios()):
         rows.append(row)
         print("  ".join(f"{k}: {v:,.4g}" if isinstance(v, float) else f"{k}: {v}" for k, v in row.items()), flush=True)
         file.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
