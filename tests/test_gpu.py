@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import subprocess
@@ -348,3 +349,27 @@ def test_a_gpu_that_fails_amid_a_chunk_leaves_the_rest_to_the_processor_or_says_
             *[("cpu", "device 'auto': out of order")] * 2,
         ]
         assert [r.margins for r in found if isinstance(r, together.Ran)] == [a.margins for a in alone]  # type: ignore[union-attr]
+
+
+def test_workers_of_a_computer_take_turns_with_its_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(together.config, "CACHE_DIR", str(tmp_path / "cache"))
+    with together._turn(), open(tmp_path / "cache" / "gpu.lock", "w") as other, pytest.raises(BlockingIOError):
+        fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    with open(tmp_path / "cache" / "gpu.lock", "w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def test_a_process_compiles_for_the_gpu_before_the_first_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    monkeypatch.setattr(together, "_lost", [])
+    monkeypatch.setattr(together, "no_gpu", lambda: asked.append("looked") or "none here")
+    together.warm_up_gpu("cpu")
+    assert asked == []
+    together.warm_up_gpu("auto")
+    assert asked == ["looked"] and together._lost == ["none here"]
+    with pytest.raises(DeviceError, match="^device 'cuda': none here$"):
+        together.warm_up_gpu("cuda")
+    monkeypatch.setattr(together, "no_gpu", lambda: "")
+    monkeypatch.setattr(together, "_on_gpu", lambda of, plants, device: asked.append((len(plants), device)))
+    together.warm_up_gpu("auto")
+    assert asked[-1] == (1, "auto")

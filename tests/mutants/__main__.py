@@ -128,7 +128,7 @@ NEAREST = {
     "hil.fmu": "fmu_spec fmu",
     "hil.calibrate": "xcp uds xcp_spec tool_states",
     "hil.uds": "uds uds_spec tool_states",
-    "hil.inject": "inject fuzz campaign loop moments inject_spec fuzz_spec scenarios_in_lanes tool_states native",
+    "hil.inject": "inject fuzz campaign loop moments inject_spec fuzz_spec scenarios_in_lanes gpu tool_states native",
     "vaneloop": "verbs",
     "vaneloop.base": (
         "base_spec files streams lean tables kept parts held machines identification learn_surfaces learn_turns "
@@ -160,7 +160,7 @@ NEAREST = {
     "vaneloop.design": "design_spec schedule_spec design schedule spatial strategies tables tolerances",
     "vaneloop.fleet": (
         "fleet_folder fleet_trends fleet_workers campaign_numbers fleet_report fleet_run campaign fleet_damage "
-        "probability cells"
+        "probability cells gpu"
     ),
     "vaneloop.pages": (
         "page_parts page_outlines page design campaign fleet_report schedule strategies spatial verbs search_commands "
