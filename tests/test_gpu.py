@@ -30,6 +30,7 @@ from vaneloop.fleet import campaign, together
 from vaneloop.fleet.plan import files_of_plan, groups, load_plan, varied
 from vaneloop.fleet.together import no_gpu
 from vaneloop.fleet.worker import work
+from vaneloop.pages.campaign import campaign_page
 
 HERE = Path(__file__).resolve().parent.parent
 # one by one on the processor, by the loop that the program compiles ahead
@@ -306,6 +307,8 @@ def test_without_a_gpu_cuda_is_one_line_and_a_later_command_goes_on(tmp_path: Pa
     view = campaign.judge(read, quantities, folder, lambda fraction: None)
     assert view.simulated_s == {"cpu": pytest.approx(0.8)} and len(view.notes) == 1
     assert view.notes[0].startswith("device 'auto': ") and view.notes[0].endswith("lanes ran 8 machines")
+    page = campaign_page(view).write(tmp_path / "c.html").read_text(encoding="utf-8")
+    assert "Simulated: 0.8 s on the processor (in lanes). device" in page and "lanes ran 8 machines." in page
     with pytest.raises(InputError, match="^device 'cuda': "):
         campaign.has_gpu("cuda", True)
     assert [campaign.has_gpu(*of) for of in (("auto", True), ("cpu", True), ("auto", False))] == [False] * 3

@@ -148,7 +148,7 @@ def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[
     """What the campaign says. The worst case of each group is saved, and run again from its saved files."""
     files = {n: str(folder.path / f) for n, f in folder.job["options"]["files"].items()}
     shown, all_groups = [], list(plans.groups(plan))
-    simulated: Counter[str] = Counter()
+    simulated: dict[str, float] = {}
     notes: Counter[str] = Counter()
     for k, g in enumerate(all_groups):
         rows = _rows(folder, g)
@@ -161,10 +161,13 @@ def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[
         beyond = [r for r in (search, levels) if r]
         worst = min([*done, *beyond], key=lambda r: (worst_share(r, among), r["point"]))
         duration = plans.scenario_of(files, g).duration
+        runs_on: Counter[str] = Counter()
         for r in (*done, *(b for b in _rows(folder, g, "[ab]*.json").values() if b), *beyond):
-            simulated.update({on: n * duration for on, n in r.get("ran", {}).items()})
+            runs_on.update(r.get("ran", {}))
             if r.get("note"):
                 notes[r["note"]] += r.get("ran", {}).get(CPU, 0)
+        for on, n in runs_on.items():
+            simulated[on] = simulated.get(on, 0.0) + n * duration
         nearest = min(beyond, key=lambda r: worst_share(r, among), default=None)
         rare = _rare(levels, plan.confidence, worst is levels)
         failed = sum(not r["held"] for r in done)
@@ -191,7 +194,7 @@ def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[
         told((k + 1) / len(all_groups))
     return CampaignView(
         plan.title, str(folder.path), folder.job["version"], [vars(q) for q in quantities], plan.confidence,
-        plan.allowed, plan.sampling, plan.seed, shown, dict(simulated),
+        plan.allowed, plan.sampling, plan.seed, shown, simulated,
         [f"{why}; the processor's lanes ran {n:,} machines" for why, n in notes.items()],
     )  # fmt: skip
 

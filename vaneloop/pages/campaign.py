@@ -236,7 +236,7 @@ def campaign_page(view: CampaignView, command: str = "") -> Page:
         _group(page, view, g)
     page.section("Basis")
     if view.simulated_s:
-        page.text(f"{view.simulated_on}. {''.join(f'{note}. ' for note in view.notes)}")
+        page.text(" ".join(f"{said}." for said in (view.simulated_on, *view.notes)))
     page.text(f"VaneLoop {view.version}. All trials, their answers and the copies of all files are in {view.run}.")
     return page
 
