@@ -505,6 +505,79 @@ def test_a_law_that_harms_a_test_log_is_not_named() -> None:
     assert any("is not named: makes other worse" in n for n in answer.diagnosis.notes)
 
 
+# ---- what an accelerometer feels ---------------------------------------------------------------------------------------
+
+
+def car(reading: str, **more: Any) -> System:
+    """A body on its spring over a measured axle, with an accelerometer on it."""
+    model: dict[str, Any] = {}
+    exec(
+        f"def rates(x, u, p):\n    return x.speed, -(p.spring * x.travel + p.damper * x.speed) / p.mass - u.axle\n"
+        f"def seen(x, u, p):\n    return x.travel, {reading}\n",
+        model,
+    )
+    return System(
+        "car", "simulate", model["rates"], inputs={"axle": "m/s^2"}, states={"travel": "m", "speed": "m/s"},
+        outputs={"travel": "m", "body": "m/s^2"}, output=model["seen"], rates={"speed": "travel"},
+        masses={"speed": "mass"}, between="line", start={"travel": 0.0, "speed": 0.0},
+        parameters=[
+            Parameter("mass", 300.0, "kg"), Parameter("spring", 17e3, "N/m"), Parameter("damper", 1300.0, "N s/m"),
+        ], **more,
+    )  # fmt: skip
+
+
+DRIVEN = np.arange(0.0, 6.0, 0.005)
+AXLE = 4.0 * wave(7, 4.0 * DRIVEN)
+
+
+def of_car(system: System) -> BoundSystem:
+    columns = {"axle": AXLE, "travel": 0.05 * wave(8, DRIVEN), "body": AXLE}
+    return BoundSystem(system, [Record("run", DRIVEN, columns)])
+
+
+FELT = "-(p.spring * x.travel + p.damper * x.speed) / p.mass"
+
+
+@pytest.mark.parametrize(
+    ("reading", "factor"),
+    [(FELT, 1.0), (f"0.1 * {FELT}", 0.1), (f"0.2 + {FELT}", 1.0), ("-p.spring * x.travel / p.mass", 0.0),
+     ("x.speed", 0.0), ("0.001 * (p.spring * x.travel + p.damper * x.speed)", 0.0)],
+)  # fmt: skip
+def test_an_output_is_an_acceleration_where_its_equation_is_that_of_a_derivative(reading: str, factor: float) -> None:
+    found = of_car(car(reading)).runner.code.accelerations
+    assert found == ([(1, 1, pytest.approx(factor))] if factor else [])
+
+
+@pytest.mark.parametrize("law", ["end_stop", "coulomb", "elastic_plastic"])
+def test_an_accelerometer_feels_what_a_law_does_to_the_motion(law: str) -> None:
+    bound = of_car(car(FELT))
+    effect = next(e for e in bound.effects if e.name == f"speed.{law}")
+    theta = bound.stage.neutral()
+    theta[bound.stage.index()[effect.name]] = effect.starts[-1]
+    travel, body = bound.run(theta[None])[0]
+    felt = CubicSpline(DRIVEN, travel)(DRIVEN, 2) + AXLE
+    nominal = -(17e3 * travel + 1300.0 * CubicSpline(DRIVEN, travel)(DRIVEN, 1)) / 300.0
+    inner = slice(40, -40)
+    assert np.std((body - nominal)[inner]) > 0.03 * np.std(body)
+    assert np.std((body - felt)[inner]) < 0.3 * np.std((body - nominal)[inner])
+
+
+# ---- units -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mass", "speed", "force"),
+    [("kg", "m/s", "N"), ("kg", "mm/s", "mN"), ("t", "m/s", "kN"), ("N s^2/mm", "mm/s", "N"),
+     ("kg m^2", "rad/s", "N m"), ("kg m^2", "rpm", "(kg m^2) (rpm)/s"), ("-", "m/s", "N")],
+)  # fmt: skip
+def test_forces_are_in_what_mass_and_velocity_make(mass: str, speed: str, force: str) -> None:
+    system = System(
+        "body", "simulate", lambda x, u, p: u.f / p.m, inputs={"f": "N"}, states={"v": speed}, outputs={"v": speed},
+        parameters=[Parameter("m", 1.0, mass)], masses={"v": "m"},
+    )  # fmt: skip
+    assert system.unit_of_force("v") == force
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 3])
 def test_two_places_that_say_the_same_leave_room_for_what_is_beside(seed: int) -> None:

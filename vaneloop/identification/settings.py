@@ -856,6 +856,12 @@ NOISY_DIFFERENCE = setting(
     "A difference is no candidate where noise may be more than this share of its spread.",
     "judgement: noise in a regressor biases its curve towards nothing",
 )
+SAME_EQUATION = setting(
+    32,
+    "draws",
+    "An output is an acceleration that follows a model's derivative through so many changes of states and parameters.",
+    "principle: equations that agree at so many random points are the same",
+)
 DERIVATIVE_PLACES = setting(
     5,
     "places",

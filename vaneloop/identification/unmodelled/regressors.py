@@ -99,7 +99,7 @@ def quantities(bound: BoundSystem, values: Array, states: Sequence[Sequence[Arra
             if all(name in r.columns for r in data.records):
                 out.append(Quantity(name, unit, INPUT + i, np.concatenate([r.columns[name] for r in data.records])))
     else:
-        unit = s.units.get("position", "m")
+        unit = s.unit_of_position
         units = {"position": unit, "velocity": f"{unit}/s", "acceleration": f"{unit}/s^2", **s.inputs}
         for i, name in enumerate(data.in_names):
             out.append(Quantity(name, units[name], INPUT + i, np.concatenate([u[i] for u in data.u])))
@@ -116,7 +116,7 @@ def quantities(bound: BoundSystem, values: Array, states: Sequence[Sequence[Arra
     shared = set.intersection(*(set(r.columns) for r in data.records))
     for name in sorted(shared - known):
         column(name, s.inputs.get(name, ""))
-    all_units = {**s.inputs, **s.outputs, **({s.position: s.units.get("position", "m")} if s.position else {})}
+    all_units = {**s.inputs, **s.outputs, **({s.position: s.unit_of_position} if s.position else {})}
     for name, unit in all_units.items():
         if name in shared:
             column(WAY + name, "-")
@@ -199,7 +199,7 @@ def _remembering(bound: BoundSystem, shared: set[str]) -> list[Quantity]:
     would tell the model what it has to say.
     """
     s, data = bound.system, bound.data
-    unit = s.units.get("position", "m")
+    unit = s.unit_of_position
     motion = ((s.position, unit), (s.velocity, f"{unit}/s")) if s.kind == "force" else ()
     driving = [(n, u) for n, u in (*motion, *s.inputs.items()) if n in shared]
 

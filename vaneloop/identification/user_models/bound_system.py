@@ -298,7 +298,7 @@ class BoundSystem:
             return out
         states = s.states
         if s.kind == "force":
-            states = {} if s.position else {"position": s.units.get("position", "m")}
+            states = {} if s.position else {"position": s.unit_of_position}
         for log in range(len(self.data.records)):
             for m, (name, unit) in enumerate(states.items()):
                 if s.start.get(name) != "fitted":

@@ -311,7 +311,7 @@ class Data:
         units = {"time": "s"} if self.ordered else {}
         u = np.concatenate(self.u, axis=1) if self.u[0].size else np.zeros((0, len(self.t)))
         names = self.in_names
-        unit = s.units.get("position", "m")
+        unit = s.unit_of_position
         all_units = {**s.inputs, "position": unit, "velocity": f"{unit}/s", "acceleration": f"{unit}/s^2"}
         for i, n in enumerate(names):
             if n == "acceleration" and not np.any(u[i]):

@@ -60,7 +60,7 @@ class Limits:
 def driven(system: System) -> dict[str, str]:
     """The channels that whoever runs the system sets, name -> unit: inputs; of kind force its motion too."""
     motion = system.position or system.velocity
-    unit = system.units.get("position", "m") if system.position else ""
+    unit = system.unit_of_position if system.position else ""
     return ({motion: unit} if system.kind == "force" and motion else {}) | dict(system.inputs)
 
 

@@ -71,7 +71,7 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
         v = np.concatenate([u[1] for u in data.u])
         x = np.concatenate([u[0] for u in data.u])
         force = size_of(np.sqrt(np.nanmean(data.measured[0] ** 2)))
-        unit = s.units.get("position", "m")
+        unit = s.unit_of_position
         size = _size(
             data.records, [u[0] for u in data.u], unit, force=force, force_unit=next(iter(s.outputs.values())),
             speed=size_of(np.sqrt(np.mean(v**2))), speed_unit=f"{unit}/s",

@@ -47,8 +47,15 @@ def build_kernels(
         text = re.sub(r"\bAT\b", at, re.sub(r"\bdx\b", to, text))
         return textwrap.indent(text, indent)
 
-    source = re.sub(r"^( *)rhs (\w+) (\w+)$", rhs, _SOURCE, flags=re.MULTILINE)
+    source = _SOURCE.replace("{accelerations}", _FELT if code.accelerations else "")
+    source = source.replace("{anything}", "True" if curved else "len(code) > 0")
+    source = re.sub(r"^( *)rhs (\w+) (\w+)$", rhs, source, flags=re.MULTILINE)
     source = source.replace("{own}", _OWN_HELD if dispatch.rate is not None else "")
+    felt = "\n".join(
+        f"out[{o}, k] += {a!r} * (dx[{w}] - d)" if code.single else f"out[{o}, k] += {a!r} * (dx[{w}] - d[{w}])"
+        for o, w, a in code.accelerations
+    )
+    source = source.replace("{felt}", textwrap.indent(felt, " " * 16).lstrip())
     source = source.replace("{curved}", _CURVED_FUNCTIONS if curved else "")
     source = source.replace("{more}", f", rough, {_CURVED}" if curved else "").replace(
         "{rooms}", _ROOMS if curved else ""
@@ -314,6 +321,23 @@ _OWN_HELD = """if memory[i] and code[i] > 100:
                         held[w] += own_rate(code[i], x[w], x[position[w]], now, since, rows[i], remembered[i]) / mass[w]
                     el"""
 
+# an output that is an acceleration by the model's own equations feels what laws and curves make of that
+_FELT = """if {anything}:
+                now = t[k]
+                if holds:
+                    for w in range(m):
+                        held[w] = 0.0
+                for i in range(len(code) if holds else 0):
+                    if memory[i] and code[i] <= 40:
+                        for j in range(MEMORY):
+                            none[j] = remembered[i, j]
+                        w = where[i]
+                        f = force_of(code[i], x[w], x[position[w]], first, rows[i], gap[w], asymmetry[w], small[w],
+                                     none)
+                        held[w] += f / mass[w]
+                rhs x dx
+                {felt}"""
+
 _SOURCE = """
 @inline_own
 def outputs(x, u, p, y):
@@ -384,6 +408,7 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, to, memory, rows, po
             shown(x, u, p, y)
             for j in range(len(out)):
                 out[j, k] = y[j]
+            {accelerations}
         if k == n - 1:
             break
         tries = False

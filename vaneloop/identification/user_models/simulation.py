@@ -118,6 +118,8 @@ class Runner:
             return
         states = [data.first_state(0, n, 0.0) for n in s.states]
         self.code.try_once(states, data.u[0][:, 0], data.measured[:, 0])
+        known = [data.records[0].columns.get(n) for n in s.states]
+        self.code.find_accelerations([1.0 if v is None else size_of(np.nanstd(v)) for v in known], data.u[0])
         self.kernel = self._tried()
 
     def _tried(self) -> Kernel:

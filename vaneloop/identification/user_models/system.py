@@ -15,12 +15,14 @@ docs/your_own_model.md says which to choose when.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hil.logs.units import factor_of
 from vaneloop.base.quantities import kind_of
 from vaneloop.identification.subsystem import Array, Parameter, StageError
 from vaneloop.identification.user_models.user_laws import Law, check_parameters, is_name
@@ -32,6 +34,8 @@ __all__ = ["Record", "System", "unknown"]
 
 KINDS = ("static", "force", "simulate", "closed_loop")
 BETWEEN = ("hold", "line", "smooth")
+NO_UNIT = ("", "-", "1")
+PREFIXES = {-6.0: "u", -3.0: "m", 0.0: "", 3.0: "k", 6.0: "M"}  # of a unit, by the power of ten
 
 
 def unknown(name: str, value: float, unit: str, low: float = -np.inf, high: float = np.inf) -> Parameter:
@@ -83,7 +87,8 @@ class System:
     rates       simulate: velocity -> displacement, for states that are these; laws of friction then act on the velocity
     masses      simulate: velocity -> name of the parameter that divides forces there (of an angular velocity: torques),
                 so that laws there are in units of force
-    force_unit  unit of forces on states with a mass; default: N, and N m where an angular velocity is driven
+    force_unit  unit of forces on states with a mass; default: what the units of the mass and of the velocity make,
+                such as N, N m where an angular velocity is driven, or mN of kg and mm/s
     output      simulate: function output(x, u, p); default: the states that are named like the outputs
     start       state -> value at the start of a log, or "fitted"; others start at their measured value, velocities of
                 rates at rest, and what is not measured is fitted
@@ -94,7 +99,7 @@ class System:
     places      where laws may act, of "input", "force", "state", "output", or channels and states by name; default:
                 everywhere
     read        function path -> {"t": ..., channel: ...} for files that `vaneloop` cannot read
-    units       of the position of kind force, {"position": "mm"}
+    units       of the position of kind force, {"position": "mm"}; default: that of its channel among the inputs, else m
     laws        laws of your own beside the library's, `Law`
     without     laws (``place.law``) that are not looked for
     """
@@ -223,9 +228,21 @@ class System:
 
     def unit_of_force(self, state: str) -> str:
         """The unit of what drives a velocity: of a force or torque where it has a mass, else of its derivative."""
+        unit = self.states[state]
         if state not in self.masses:
-            return f"({self.states[state]})/s"
-        return self.force_unit or ("N m" if kind_of(self.states[state]) == "angular velocity" else "N")
+            return f"({unit})/s"
+        if self.force_unit:
+            return self.force_unit
+        mass = next(p.unit for p in self.parameters if p.name == self.masses[state])
+        usual = "N m" if kind_of(unit) == "angular velocity" else "N"
+        factor = factor_of(f"({mass})*({unit})/s", usual.replace(" ", "*")) if mass not in NO_UNIT else (1.0, 0.0)
+        prefix = PREFIXES.get(round(math.log10(factor[0]), 6)) if isinstance(factor, tuple) else None
+        return f"({mass}) ({unit})/s" if prefix is None else f"{prefix}{usual}"
+
+    @property
+    def unit_of_position(self) -> str:
+        """The unit of the position of kind force: what ``units`` says, else that of the channel; else m."""
+        return self.units.get("position") or self.inputs.get(self.position or "") or "m"
 
     def channels(self) -> tuple[str, ...]:
         """Names that a log must have."""

@@ -5,6 +5,7 @@ wrong in them becomes one line.
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import sys
 import traceback
 import types
@@ -21,6 +22,7 @@ from numba.core.compiler_machinery import FunctionPass, register_pass
 from numba.core.ir_utils import build_definitions, find_callname, guard
 from numba.core.untyped_passes import ReconstructSSA
 
+from vaneloop.identification.settings import SAME_EQUATION
 from vaneloop.identification.subsystem import Array, StageError
 from vaneloop.identification.user_models.system import System
 
@@ -33,11 +35,13 @@ class UserCode:
     P, U, X, Y, R   types of their arguments: parameters, what drives the model, states, outputs, and what the control
                     follows
     single, single_out, single_control   the model, output or control returns a number and no sequence
+    accelerations   outputs that are the derivative of a velocity, as `_accelerations` has them
     """
 
     def __init__(self, system: System, in_names: list[str]):
         self.system, self.in_names = system, in_names
         self.single = self.single_out = self.single_control = False
+        self.accelerations: list[tuple[int, int, float]] = []
         s = system
         self.P = _tuple_type("P", [p.name for p in s.parameters])
         self.U = _tuple_type("U", list(s.commands) if s.kind == "closed_loop" else self.in_names)
@@ -108,6 +112,47 @@ class UserCode:
             o = self.call("output", s.output, x, u, p)
             self.flat("output", o, len(s.outputs), ", ".join(s.outputs))
             self.single_out = np.ndim(o) == 0
+
+    def find_accelerations(self, sizes: Sequence[float], drives: Array) -> None:
+        """Find the outputs that are accelerations by the model's own equations: (output, velocity, factor).
+
+        Such an output is a constant factor times the derivative of a velocity, and whatever else the inputs give. It is
+        one if it follows that derivative through `SAME_EQUATION` states and parameters drawn at random. What a law does
+        to the motion an accelerometer then feels, though the user's formula cannot know of the law.
+
+        sizes   of the states; ``drives``: values of the inputs, float64[inputs, samples]
+        """
+        s, rng = self.system, np.random.default_rng(0)
+        if s.kind != "simulate" or s.output is None or not s.rates or not s.parameters:
+            return
+        values = np.array([q.value for q in s.parameters])
+        usual = np.where(values == 0.0, 1.0, values)
+        low, high = (np.array([getattr(q, side) for q in s.parameters]) for side in ("low", "high"))
+        rows = []  # of each input: what outputs and derivatives are, of what they are at its first draw of the others
+        for u in drives[:, rng.integers(0, drives.shape[1], 4)].T if len(drives) else np.zeros((4, 1)):
+            drawn: list[tuple[Array, Array, Array, Array]] = []
+            for k in range(SAME_EQUATION // 4 + 1):
+                # by turns the states alone, and the parameters alone
+                x = rng.standard_normal(len(sizes)) * sizes if k % 2 or not drawn else drawn[-1][0]
+                p = np.clip(usual * 2.0 ** rng.uniform(-1, 1, len(usual)), low, high) if not k % 2 else drawn[-1][1]
+                args = self.X(*x), self.U(*u), self.P(*p)
+                try:
+                    with np.errstate(all="ignore"):
+                        both = [np.atleast_1d(np.asarray(f(*args), dtype=float)) for f in (s.output, s.model)]
+                except Exception:  # the user's model may be nothing there
+                    return
+                drawn.append((x, p, *both))
+            rows += [(b[2] - a[2], b[3] - a[3]) for a, b in itertools.pairwise(drawn)]
+        outputs, rates = (np.array([r[i] for r in rows]) for i in (0, 1))
+        turned = np.arange(len(rows)) % (SAME_EQUATION // 4) % 2 == 1  # the parameters alone changed
+        for w in (list(s.states).index(v) for v in s.rates):
+            d = rates[:, w]
+            if not (np.isfinite(d).all() and d[turned].any() and d[~turned].any()):
+                continue
+            for o, y in enumerate(outputs.T):
+                factor = float(y @ d / (d @ d)) if np.isfinite(y).all() else 0.0
+                if factor and np.all(np.abs(y - factor * d) <= 1e-9 * np.max(np.abs(y))):
+                    self.accelerations.append((o, w, factor))
 
     def static(self, p: Array, u: Array, t: Array, check: bool = False) -> Array:
         """Outputs float64[outputs, samples] of a model of kind static or force, driven by ``u`` at times ``t``."""
