@@ -9,6 +9,7 @@ import re
 import runpy
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -505,7 +506,7 @@ def test_a_law_that_harms_a_test_log_is_not_named() -> None:
     assert any("is not named: makes other worse" in n for n in answer.diagnosis.notes)
 
 
-# ---- what an accelerometer feels ---------------------------------------------------------------------------------------
+# ---- what an accelerometer feels -------------------------------------------------------------------------------------
 
 
 def car(reading: str, **more: Any) -> System:
@@ -562,7 +563,42 @@ def test_an_accelerometer_feels_what_a_law_does_to_the_motion(law: str) -> None:
     assert np.std((body - felt)[inner]) < 0.3 * np.std((body - nominal)[inner])
 
 
-# ---- units -------------------------------------------------------------------------------------------------------------
+# ---- what acts between two bodies ------------------------------------------------------------------------------------
+
+
+def coupled(x: Any, u: Any, p: Any) -> Any:
+    spring = 40.0 * (x.x - x.y)
+    return x.v, -spring / p.m, x.w, spring / p.n
+
+
+BODIES = System(
+    "bodies", "simulate", coupled, states={"x": "m", "v": "m/s", "y": "m", "w": "m/s"}, outputs={"x": "m", "y": "m"},
+    parameters=[Parameter("m", 2.0, "kg"), Parameter("n", 0.5, "kg")], rates={"v": "x", "w": "y"},
+    masses={"v": "m", "w": "n"}, start={"x": 0.0, "v": 1.0, "y": 0.0, "w": -2.0},
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("law", ["end_stop", "coulomb", "cubic_spring", "elastic_plastic", "bouc_wen"])
+def test_a_law_between_two_bodies_keeps_their_momentum(law: str) -> None:
+    t = np.arange(0.0, 5.0, 0.01)
+    bound = BoundSystem(BODIES, [Record("run", t, {"x": 0.1 * np.sin(t), "y": -0.1 * np.sin(t)})])
+    effect = next(e for e in bound.effects if e.name == f"v_minus_w.{law}")
+    theta = bound.stage.neutral()
+    nominal = bound.run(theta[None])[0]
+    theta[bound.stage.index()[effect.name]] = effect.starts[-1]
+    x, y = bound.run(theta[None])[0]
+    assert np.max(np.abs(x - nominal[0])) > 1e-3 * np.ptp(x)
+    np.testing.assert_allclose(2.0 * x + 0.5 * y, (2.0 * 1.0 - 0.5 * 2.0) * t, atol=1e-9)
+
+
+def test_between_a_body_and_one_without_a_mass_no_law_acts() -> None:
+    t = np.arange(0.0, 5.0, 0.01)
+    free = replace(BODIES, masses={"v": "m"})
+    bound = BoundSystem(free, [Record("run", t, {"x": 0.1 * np.sin(t), "y": -0.1 * np.sin(t)})])
+    assert not any("_minus_" in e.name for e in bound.effects)
+
+
+# ---- units -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

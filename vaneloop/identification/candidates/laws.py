@@ -285,7 +285,8 @@ def force_of(
             level = p[1] * (1.0 + asymmetry if f > 0.0 else 1.0 - asymmetry)
             if (f > 0.0) == (dx > 0.0):
                 left = 1.0 - (abs(f) / level) ** p[2]
-                f += p[0] * dx * max(left, 0.0)
+                middle = min(abs(f + 0.5 * p[0] * dx * max(left, 0.0)) / level, 1.0)  # Runge, of second order
+                f += p[0] * dx * (1.0 - middle ** p[2])
                 f = min(max(f, -level), level)
                 dx = 0.0
             else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from vaneloop.identification.user_models.codegen import Dispatch, try_law
 from vaneloop.identification.user_models.data import Data
 from vaneloop.identification.user_models.exogenous_regressors import (
     DISTANCE,
+    MINUS,
     SINCE,
     STOPS,
     TIME,
@@ -28,13 +30,14 @@ from vaneloop.identification.user_models.exogenous_regressors import (
 )
 from vaneloop.identification.user_models.motion import smoothed
 from vaneloop.identification.user_models.simulation import Placed, Runner
-from vaneloop.identification.user_models.system import Record
+from vaneloop.identification.user_models.system import Record, System
 from vaneloop.identification.user_models.terms import COLUMN, HOW, INPUT, OUTPUT, Curve, Surface, runs
 
 __all__ = ["CURVE_LAW", "Course", "from_file", "nominal_course", "places"]
 
 # of a speed whose displacement is no state
 NOT_OF_SPEED = tuple(n for n in FORCE_LAWS if n not in ("coulomb", "stribeck", "friction_asymmetry"))
+NOT_BETWEEN = ("force_offset", "backlash_gap", "friction_asymmetry")  # two bodies
 SENSOR_OF_FORCE = ("gain", "saturation", "lag", "second_order_lag", "dead_time")  # what follows a sum of forces
 
 
@@ -85,10 +88,8 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
             if name in s.rates.values() and name not in s.rates:
                 continue  # a displacement is the integral of its velocity, whatever else is missing
             values = states[i]
-            rates = np.concatenate([np.gradient(w, r.t) for w, r in zip(values, data.records, strict=True)])
-            m = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
             moving: dict[str, Any] = {
-                "force": size_of(np.sqrt(np.nanmean(rates**2)) * m), "force_unit": s.unit_of_force(name),
+                "force": _force(s, data, values, name), "force_unit": s.unit_of_force(name),
                 "speed": size_of(np.sqrt(np.nanmean(np.concatenate(values) ** 2))), "speed_unit": unit,
             }  # fmt: skip
             if name in s.rates:
@@ -115,6 +116,21 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
                 for j, (other, other_unit) in enumerate(s.inputs.items() if s.kind == "simulate" else ()):
                     if other_unit == unit and STATE_LAWS["radiation_to"].suits(unit):
                         put(f"{name}.radiation_to_{other}", STATE_LAWS["radiation_to"], "state", i, size, INPUT + j)
+        for a, b in _bodies(s):
+            i, j = (list(s.states).index(n) for n in (a, b))
+            slip = [v - w for v, w in zip(states[i], states[j], strict=True)]
+            front, back = (list(s.states).index(s.rates[n]) for n in (a, b))
+            bend = np.concatenate(states[front]) - np.concatenate(states[back])
+            forces = [_force(s, data, states[k], v) for k, v in ((i, a), (j, b))]
+            size = _size(
+                data.records, slip, s.states[a], force=float(np.sqrt(forces[0] * forces[1])),
+                force_unit=s.unit_of_force(a), speed=size_of(np.sqrt(np.nanmean(np.concatenate(slip) ** 2))),
+                speed_unit=s.states[a], travel=size_of(np.ptp(bend) / 2), travel_unit=s.states[s.rates[a]],
+                ends=_ends(bend),
+            )  # fmt: skip
+            for law in LAWS["force"].values():
+                if law.name not in NOT_BETWEEN:
+                    put(f"{a}{MINUS}{b}.{law.name}", law, "force", i, size, j)
     signals = s.commands if s.kind == "closed_loop" else s.inputs
     for i, (name, unit) in enumerate(signals.items()):
         if s.allows("input", name):
@@ -135,6 +151,22 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
         prefix = s.reading_of(name)
         add(prefix, "output", name, i, "signal", _size(data.records, rows, s.outputs[name]), leave)
     return out, effects
+
+
+def _bodies(s: System) -> list[tuple[str, str]]:
+    """Pairs of velocities between which forces may act: both have a displacement and a mass, in the same units."""
+    units = {
+        v: (s.states[v], s.states[x], s.unit_of_force(v)) for v, x in s.rates.items()
+        if v in s.masses and s.allows("force", v)
+    }  # fmt: skip
+    return [(a, b) for a, b in combinations(units, 2) if units[a] == units[b]]
+
+
+def _force(s: System, data: Data, values: Sequence[Array], name: str) -> float:
+    """RMS of what moves a state: of the force where it has a mass, else of its derivative."""
+    rates = np.concatenate([np.gradient(w, r.t) for w, r in zip(values, data.records, strict=True)])
+    mass = next((q.value for q in s.parameters if q.name == s.masses.get(name)), 1.0)
+    return size_of(np.sqrt(np.nanmean(rates**2)) * mass)
 
 
 def _ends(x: Array) -> tuple[float, float]:

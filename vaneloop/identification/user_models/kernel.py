@@ -149,7 +149,9 @@ if len(code) > 0:
                 other = 0.0 if to[i] < INPUT else u[to[i] - INPUT]
                 dx[w] -= state_rate(c, AT[w], rows[i], other)
         elif not memory[i]:
-            dx[w] -= force_of(c, AT[w], AT[position[w]], False, rows[i], gap[w], asymmetry[w], small[w], none) / mass[w]
+            f = force_of(c, against(AT, w, to[i]), way(AT, position, w, to[i]), False, rows[i], own(gap, w, to[i]),
+                         own(asymmetry, w, to[i]), small[w], none)
+            push(dx, f, w, to[i], mass)
     if holds:
         for w in range(m):
             dx[w] -= held[w]
@@ -332,9 +334,9 @@ _FELT = """if {anything}:
                         for j in range(MEMORY):
                             none[j] = remembered[i, j]
                         w = where[i]
-                        f = force_of(code[i], x[w], x[position[w]], first, rows[i], gap[w], asymmetry[w], small[w],
-                                     none)
-                        held[w] += f / mass[w]
+                        f = force_of(code[i], against(x, w, to[i]), way(x, position, w, to[i]), first, rows[i],
+                                     own(gap, w, to[i]), own(asymmetry, w, to[i]), small[w], none)
+                        push(held, -f, w, to[i], mass)
                 rhs x dx
                 {felt}"""
 
@@ -353,6 +355,30 @@ def controls(r, y, p, u):
 def between(u, slope, t, k, part):
     h, rise = t[k + 1] - t[k], u[k + 1] - u[k]
     return part * (1.0 - part) * ((1.0 - part) * (h * slope[k] - rise) - part * (h * slope[k + 1] - rise))
+
+
+# a force acts on a body from outside, or between two (to: the other velocity), with its reaction on the other; what
+# changes the forces on a body changes none of those
+@inline
+def against(x, w, to):
+    return x[w] - x[to] if to >= 0 else x[w]
+
+
+@inline
+def way(x, position, w, to):
+    return x[position[w]] - x[position[to]] if to >= 0 else x[position[w]]
+
+
+@inline
+def own(of, w, to):
+    return 0.0 if to >= 0 else of[w]
+
+
+@inline
+def push(dx, f, w, to, mass):
+    dx[w] -= f / mass[w]
+    if to >= 0:
+        dx[to] += f / mass[to]
 
 
 {curved}@jit
@@ -424,9 +450,13 @@ def run(t, inputs, p, x0, restart, at_restart, code, where, to, memory, rows, po
                 for i in range(len(code) if holds else 0):
                     {own}if memory[i] and code[i] <= 40:
                         w = where[i]
-                        f = force_of(code[i], x[w], x[position[w]], first, rows[i], gap[w], asymmetry[w], small[w],
-                                     remembered[i])
-                        held[w] += f / mass[w]
+                        v, d = against(x, w, to[i]), way(x, position, w, to[i])
+                        g, a = own(gap, w, to[i]), own(asymmetry, w, to[i])
+                        f = force_of(code[i], v, d, first, rows[i], g, a, small[w], remembered[i])
+                        for j in range(MEMORY):
+                            none[j] = remembered[i, j]
+                        f = force_of(code[i], v, d + 0.5 * h * v, False, rows[i], g, a, small[w], none)
+                        push(held, -f, w, to[i], mass)
                 first = False
                 # the four slopes of Runge and Kutta; written out four times, they took 2.4 times as long to compile
                 for j in range(4):

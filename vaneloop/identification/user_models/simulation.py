@@ -47,7 +47,7 @@ _SWITCHING = frozenset(laws.SWITCHING.tolist())
 class Placed:
     """A law at a place: effect name, law, kind of place, index of the signal or state there, constant.
 
-    to     what else it acts between: a state, from `INPUT` on an input; -1: nothing
+    to     what else it acts between: a state, the velocity of a second body, from `INPUT` on an input; -1: nothing
     curve  what it does, where it is a function of some quantity that nobody named; its place is then "curve"
     """
 

@@ -130,7 +130,7 @@ class UserCode:
         low, high = (np.array([getattr(q, side) for q in s.parameters]) for side in ("low", "high"))
         rows = []  # of each input: what outputs and derivatives are, of what they are at its first draw of the others
         for u in drives[:, rng.integers(0, drives.shape[1], 4)].T if len(drives) else np.zeros((4, 1)):
-            drawn: list[tuple[Array, Array, Array, Array]] = []
+            drawn: list[tuple[Array, ...]] = []
             for k in range(SAME_EQUATION // 4 + 1):
                 # by turns the states alone, and the parameters alone
                 x = rng.standard_normal(len(sizes)) * sizes if k % 2 or not drawn else drawn[-1][0]
