@@ -335,6 +335,18 @@ def test_one_amplitude_confirms_no_memory_and_what_remembers_nothing_needs_no_ot
     assert curve_choice.another_confirms(learner, before, tried("u"))
 
 
+@pytest.mark.parametrize(("change", "confirmed"), [(-0.03, True), (-0.01, False), (0.09, False)])
+def test_what_is_of_time_must_hold_on_a_validation_log_where_there_is_one(change: float, confirmed: bool) -> None:
+    learner: Any = SimpleNamespace(
+        decisions=Decisions(), change=lambda *_: {"v": change, "f": -1.0}, ground=SimpleNamespace(tests=frozenset("v"))
+    )
+    before: Any = SimpleNamespace(names=())
+    assert curve_choice.another_confirms(learner, before, tried("time")) == confirmed
+    assert curve_choice.another_confirms(learner, before, tried("u"))  # a measured value may stay where it was
+    learner.ground.tests = frozenset()
+    assert curve_choice.another_confirms(learner, before, tried("time"))
+
+
 def test_curves_stand_instead_of_laws_with_names_by_themselves_or_by_a_formula(monkeypatch: pytest.MonkeyPatch) -> None:
     learner: Any = SimpleNamespace(speaks=True, ground=SimpleNamespace(tests=frozenset("t")), change=lambda *_: {})
     monkeypatch.setattr(curve_choice, "better_than", lambda learner, named, t: t.candidate.name != "y.curve_of_poor")

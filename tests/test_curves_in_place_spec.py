@@ -445,7 +445,7 @@ def moving(**more: Any) -> Any:
     """A stand-in for a model that moves, bound to one log."""
     given: dict[str, Any] = {
         "kind": "simulate", "model": tanks, "states": {"h1": "m", "h2": "m"}, "inputs": {"q": "m"},
-        "outputs": {"h1": "m", "level": "m"}, "commands": {}, "units": {}, "position": "", "velocity": "",
+        "outputs": {"h1": "m", "level": "m"}, "commands": {}, "unit_of_position": "m", "position": "", "velocity": "",
         "parameters": [SimpleNamespace(name="c", value=0.3, tolerance=0.0)], "rates": {}, "masses": {},
         "unit_of_force": lambda name: "N", "allows": lambda kind, name: True,
         "reading_of": lambda name: f"{name}_sensor",

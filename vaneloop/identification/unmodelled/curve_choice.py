@@ -173,8 +173,12 @@ def another_confirms(learner: CurveProblem, before: FittedCandidate, tried: Fitt
     in turn; of one log, the half of its blocks in which the channel swings least. The other half knows all radii and
     values that these have; what they know says nothing of wider swings. As the one question that is asked, it must be
     answered as well as a place is earned.
+
+    What is of no measured value, such as time, asks for no other log. But where validation logs are there, one of them
+    must be better for it: with its many splines time imitates whatever happened in the fitted log.
     """
-    if not tried.candidate.quantity.remembers:
+    c = tried.candidate
+    if not c.quantity.remembers and (strange(c) <= MEASURED or not learner.ground.tests):
         return True
     return learner.decisions.decide([CONFIRMED], _confirmation(learner, before, tried), tried.names, before.names)
 

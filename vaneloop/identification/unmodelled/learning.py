@@ -153,10 +153,10 @@ class CurveSearch(CurveProblem):
                 break
             harms.append(f"{best.candidate.name} fits, but is not learned: {why}")
         else:
-            forgets = (
-                f"{near[0].candidate.name} fits, but is not learned: it remembers, and neither another log nor "
-                f"another amplitude confirms it"
-            )
+            confirms = "no validation log is better for it"
+            if near[0].candidate.quantity.remembers:
+                confirms = "it remembers, and neither another log nor another amplitude confirms it"
+            forgets = f"{near[0].candidate.name} fits, but is not learned: {confirms}"
             self.out.notes += harms[:1] or [forgets]
             return None
         limit = left[chosen.candidate.name] + RIVAL

@@ -32,6 +32,7 @@ from vaneloop.identification.unmodelled.curve_candidates import SurfaceCandidate
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate, Outcome, plain, strange
 from vaneloop.identification.unmodelled.problem import CurveProblem
 from vaneloop.identification.unmodelled.screening import smoothed
+from vaneloop.identification.user_models.exogenous_regressors import TIME
 
 __all__ = ["SurfaceSelection"]
 
@@ -39,20 +40,28 @@ __all__ = ["SurfaceSelection"]
 class SurfaceSelection:
     """A surface in place of the curves that were learned: the candidates of `stepwise` are models with one surface.
 
+    Time is the last quantity: a surface of two others that does as well stands in the place of a curve over time.
+
     out      what has been learned: gets notes
     nothing  the model without any curve
     before   the model that a surface must be accepted over: the last curve's, or that without any
+    drifting the model whose last curve is over time, instead of which a surface may stand; None: there is none
     """
 
     def __init__(self, learner: CurveProblem, out: Outcome, nothing: FittedCandidate):
         self.learner, self.out, self.nothing = learner, out, nothing
         self.before = out.tried[-1] if out.tried else nothing
+        self.drifting: FittedCandidate | None = None
+        if out.tried and out.tried[-1].candidate.quantity.name == TIME:
+            self.drifting, self.before = self.before, ([nothing, *out.tried])[-2]
 
     def wants_more(self, current: FittedCandidate) -> bool:
         """Whether the curves, or their closed forms, leave clearly more than noise."""
         learner = self.learner
         if current is not self.before or learner.shape or not (learner.ground.surfaces and learner.ranked):
             return False
+        if self.drifting is not None:
+            return True
         if any(not learner.fails(f) for _, f in current.formulas or ()):
             return False
         return rms_of(current.judge, current.fit) > UNKNOWN
@@ -66,7 +75,12 @@ class SurfaceSelection:
         learner, nothing = self.learner, self.nothing
         sums = list(learner.each(lambda t: _sum(learner, nothing, t), tried))
         others = [nothing, *([current] if current is not nothing else []), *sums]
-        return [t for t in tried if all(learner.accepts(other, t) for other in others)]
+        earned = [t for t in tried if all(learner.accepts(other, t) for other in others)]
+        if (over_time := self.drifting) is None:
+            return earned
+        return [
+            t for t in earned if learner.score(t, [t, over_time]) < learner.score(over_time, [t, over_time]) + RIVAL
+        ]
 
     def chosen(self, current: FittedCandidate, accepted: Sequence[FittedCandidate]) -> FittedCandidate | None:
         """Of those that do as well as the best the preferred one, unless it harms a validation log."""
