@@ -177,6 +177,8 @@ def test_friction_opposes_motion_and_differs_with_direction() -> None:
     x = np.zeros(5)
     assert list(force("coulomb", (3.0,), x, v)) == [-3.0, -3.0, 0.0, 3.0, 3.0]
     assert list(force("coulomb", (3.0,), x, v, asymmetry=-0.2)) == pytest.approx([-3.6, -3.6, 0.0, 2.4, 2.4])
+    smooth = force("smooth_coulomb", (3.0, 0.1), x, v)
+    assert smooth == pytest.approx(3.0 * np.tanh(v / 0.1))
     s = force("stribeck", (3.0, 1.0, 0.1), x, v)
     assert s[4] == pytest.approx(3.0) and s[3] == pytest.approx(3.0 + np.exp(-1.0))
     assert list(force("viscous", (3.0,), x, v)) == pytest.approx(3.0 * v)

@@ -51,7 +51,7 @@ def laws_of(states: dict[str, str], inputs: dict[str, str], **more: Any) -> tupl
 
 def test_a_velocity_without_a_displacement_has_friction_and_every_other_state_has_none() -> None:
     bound, laws = laws_of({"w": "rad/s", "flow": "l/s"}, {"u": "V"}, masses={"w": "m"})
-    friction = {"coulomb", "stribeck", "friction_asymmetry"}
+    friction = {"coulomb", "smooth_coulomb", "stribeck", "friction_asymmetry"}
     assert {n for n in laws if n.partition(".")[2] in friction} == {f"w.{f}" for f in friction}
     assert not laws & {"w.spring", "w.end_stop", "w.viscous", "flow.radiation"} and {"w.leak", "flow.leak"} <= laws
     (coulomb,) = next(e.parameters for e in bound.effects if e.name == "w.coulomb")
@@ -64,6 +64,8 @@ def test_what_is_no_store_does_not_overflow_and_only_what_is_warm_radiates() -> 
     assert {n for n in hot if "_to_" in n} == {"a.radiation_to_room", "b.radiation_to_room"}
     assert {n for n in wet if "_to_" in n} == {"a.overflow_to_b", "b.overflow_to_a"}
     assert {"a.radiation", "b.radiation"} <= hot and not {n for n in wet if "radiation" in n}
+    powers = {"a.square_root", "a.quadratic_drag", "a.cubic"}  # of degC they would be others than of degF
+    assert powers <= wet and not powers & hot and "a.leak" in hot
 
 
 def plate(x: Any, u: Any, p: Any) -> float:

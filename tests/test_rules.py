@@ -48,6 +48,13 @@ def comparison(before: list[float], after: list[float], form: float = 0.0) -> Co
     return Comparison(judge, fits[0], fits[1], 1.0, form)
 
 
+@pytest.mark.parametrize(("was", "now", "share"), [(8.0, 2.0, 0.5), (5.0, 4.0, 0.125), (5.0, 5.0, 0.0)])
+def test_what_the_model_before_predicted_badly_is_no_merit_of_the_new_term(was: float, now: float, share: float) -> None:
+    c = comparison([8.0] * BLOCKS, [4.0] * BLOCKS)  # held out half goes
+    c.before.cost[:], c.after.cost[:] = 50.0 * was, 50.0 * now  # where all blocks are fitted
+    assert c.share_of_fall == pytest.approx(share)
+
+
 @given(before=LEVELS, after=LEVELS)
 @settings_of(max_examples=examples(60), deadline=None)
 def test_against_a_known_noise_the_rules_are_the_three_conditions(before: list[float], after: list[float]) -> None:

@@ -201,9 +201,9 @@ def argument(code: int, y: float, p: Array) -> float:
 FORCE_OFFSET, VISCOUS, COULOMB, STRIBECK, QUADRATIC_DRAG, SPRING, CUBIC_SPRING, ELASTIC_PLASTIC, BOUC_WEN = range(
     21, 30
 )
-BACKLASH_GAP, FRICTION_ASYMMETRY, END_STOP = range(30, 33)
+BACKLASH_GAP, FRICTION_ASYMMETRY, END_STOP, SMOOTH_COULOMB = range(30, 34)
 HYSTERETIC = (ELASTIC_PLASTIC, BOUC_WEN)  # carry a force at rest: where they start is unknown
-SWITCHING = np.array([COULOMB, STRIBECK, ELASTIC_PLASTIC, BOUC_WEN, BACKLASH_GAP, FRICTION_ASYMMETRY])
+SWITCHING = np.array([COULOMB, SMOOTH_COULOMB, STRIBECK, ELASTIC_PLASTIC, BOUC_WEN, BACKLASH_GAP, FRICTION_ASYMMETRY])
 SWITCHING.setflags(write=False)
 MODIFIERS = (
     BACKLASH_GAP,
@@ -237,6 +237,8 @@ def force_of(
     if code == STRIBECK:  # Coulomb level, what breaking away takes beyond it, speed over which that fades
         level = p[0] + p[1] * math.exp(-((v / p[2]) ** 2)) if p[2] > 0.0 else p[0]
         return level * _slip(v, small) * (1.0 + asymmetry if v > 0.0 else 1.0 - asymmetry)
+    if code == SMOOTH_COULOMB:  # level, speed over which it builds up
+        return p[0] * math.tanh(v / p[1]) * (1.0 + asymmetry if v > 0.0 else 1.0 - asymmetry)
     if code == QUADRATIC_DRAG:
         return p[0] * v * abs(v)
     if code == END_STOP:  # contact stiffness p[0] beyond the displacements p[1] and p[2]

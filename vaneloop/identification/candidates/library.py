@@ -251,12 +251,20 @@ def _coulomb(z: Size) -> _Made:
 def _stribeck(z: Size) -> _Made:
     ps = (
         Parameter("friction", 0.0, z.force_unit, 0.0, 5.0 * z.force),
-        Parameter("breakaway_excess", 0.0, z.force_unit, -2.0 * z.force, 5.0 * z.force),
+        Parameter("breakaway_excess", 0.0, z.force_unit, 0.0, 5.0 * z.force),
         Parameter("speed", 0.3 * z.speed, z.speed_unit, 0.01 * z.speed, 5.0 * z.speed),
     )
     return ps, tuple(
-        (f * z.force, e * f * z.force, w * z.speed) for f in (0.1, 0.5) for e in (0.5, -0.5) for w in (0.1, 0.5)
+        (f * z.force, e * f * z.force, w * z.speed) for f in (0.1, 0.5) for e in (0.2, 0.7) for w in (0.1, 0.5)
     )
+
+
+def _smooth_coulomb(z: Size) -> _Made:
+    ps = (
+        Parameter("friction", 0.0, z.force_unit, 0.0, 5.0 * z.force),
+        Parameter("speed", 0.3 * z.speed, z.speed_unit, 0.01 * z.speed, 5.0 * z.speed, shape=True),
+    )
+    return ps, tuple((f * z.force, w * z.speed) for f in (0.02, 0.1, 0.4, 1.5) for w in (0.1, 0.3, 1.0))
 
 
 def _quadratic_drag(z: Size) -> _Made:
@@ -513,10 +521,17 @@ LAWS: dict[str, dict[str, Law]] = {
             Law(
                 "stribeck",
                 laws.STRIBECK,
-                "Coulomb friction that is larger (or smaller) at small speed",
+                "Coulomb friction that is larger at small speed",
                 _stribeck,
                 "spikes at reversals",
                 holds=("coulomb", (None, 0.0, np.nan)),
+            ),
+            Law(
+                "smooth_coulomb",
+                laws.SMOOTH_COULOMB,
+                "friction that builds up over a speed, then stays: a digressive damper",
+                _smooth_coulomb,
+                "the error bends at small speed",
             ),
             Law(
                 "bouc_wen",

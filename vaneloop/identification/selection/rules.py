@@ -192,9 +192,13 @@ class Comparison:
 
     @property
     def share_of_fall(self) -> float:
-        """Share of the sum of squares that goes."""
+        """Share of the sum of squares that goes, held out, and no more of it than goes where all blocks are fitted.
+
+        What the model before knew too little of to predict blocks left out is no merit of the new term.
+        """
         was, now = self.squares
-        return 1.0 - now / was
+        fitted, left = (float(self._of_noise(f.cost).sum()) for f in (self.before, self.after))
+        return min(was - now, fitted - left) / was
 
     @property
     def least_share(self) -> float:
@@ -233,8 +237,12 @@ class Comparison:
 
     def _levels(self, fit: Fit, least: float = 1.0) -> Array:
         """Held-out sum of squares of every block, not below ``least`` (noise floors, RMS)."""
+        return self._of_noise(fit.held_out, least)
+
+    def _of_noise(self, squares: Array, least: float = 1.0) -> Array:
+        """Sums of squares of the blocks that have samples, not below ``least`` (noise floors, RMS)."""
         use = self.judge.samples > 0
-        return np.maximum(fit.held_out[use], self.judge.samples[use].astype(float) * least * least)
+        return np.maximum(squares[use], self.judge.samples[use].astype(float) * least * least)
 
 
 def gain(before: Fit, after: Fit, correlation: float) -> tuple[float, float]:

@@ -54,13 +54,15 @@ def screened(learner: CurveProblem, current: FittedCandidate, many: int, apart: 
 
 def _best_elsewhere(chosen: Sequence[Promise], others: Sequence[Promise]) -> list[Promise]:
     """The best of each place that none of the ``chosen`` is at: one step says which quantity suits a place, and less
-    which of two places will do more, of which one is crooked and the other is not.
+    which of two places will do more, of which one is crooked and the other is not. And what is at each derivative
+    itself, the plainest of all: how a store loses what it holds.
     """
     best: dict[tuple[str, str], Promise] = {}
     for one in (*chosen, *others):
         best.setdefault((one[1].how, one[1].at), one)
     have = {id(one) for one in chosen}
-    return [one for one in best.values() if id(one) not in have]
+    more = [one for one in best.values() if id(one) not in have]
+    return [*more, *(p for p in others if p[1].how == "state adds" and strange(p[1]) == 0 and p not in more)]
 
 
 def _one_lag(promises: Iterable[Promise]) -> list[Promise]:

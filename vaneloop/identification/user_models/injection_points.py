@@ -13,6 +13,7 @@ from plant.model import Learned
 from vaneloop.base.durations import folded
 from vaneloop.base.errors import InputError
 from vaneloop.base.forms import NAMED
+from vaneloop.base.quantities import absolute_zero
 from vaneloop.identification.candidates.library import FORCE_LAWS, LAWS, SIGNAL_LAWS, STATE_LAWS, Law, Size
 from vaneloop.identification.settings import CURVE_BOUND, LEVEL_SPREAD, RUN_AWAY
 from vaneloop.identification.subsystem import Array, Effect, Parameter, StageError, size_of
@@ -36,7 +37,10 @@ from vaneloop.identification.user_models.terms import COLUMN, HOW, INPUT, OUTPUT
 __all__ = ["CURVE_LAW", "Course", "from_file", "nominal_course", "places"]
 
 # of a speed whose displacement is no state
-NOT_OF_SPEED = tuple(n for n in FORCE_LAWS if n not in ("coulomb", "stribeck", "friction_asymmetry"))
+OF_SPEED = ("coulomb", "smooth_coulomb", "stribeck", "friction_asymmetry")
+NOT_OF_SPEED = tuple(n for n in FORCE_LAWS if n not in OF_SPEED)
+# what asks for a zero that means something, which that of degC and degF does not
+OF_A_TRUE_ZERO = ("square_root", "quadratic_drag", "cubic")
 NOT_BETWEEN = ("force_offset", "backlash_gap", "friction_asymmetry")  # two bodies
 SENSOR_OF_FORCE = ("gain", "saturation", "lag", "second_order_lag", "dead_time")  # what follows a sum of forces
 
@@ -106,7 +110,8 @@ def places(data: Data, course: Course, dispatch: Dispatch) -> tuple[list[Placed]
                 add(name, "force", name, i, "force", size)
             else:
                 size = _size(data.records, values, unit)
-                add(name, "state", name, i, "state", size, ("overflow", "radiation_to"))
+                relative = OF_A_TRUE_ZERO if absolute_zero(unit) > 0.0 else ()
+                add(name, "state", name, i, "state", size, ("overflow", "radiation_to", *relative))
                 if name in s.speeds:  # friction asks for no displacement; its other laws are those of a state
                     add(name, "force", name, i, "force", _size(data.records, values, unit, **moving), NOT_OF_SPEED)
                 for j, (other, other_unit) in enumerate(s.states.items()):  # into any other of the same kind

@@ -235,8 +235,10 @@ class System:
             return self.force_unit
         mass = next(p.unit for p in self.parameters if p.name == self.masses[state])
         usual = "N m" if kind_of(unit) == "angular velocity" else "N"
-        factor = factor_of(f"({mass})*({unit})/s", usual.replace(" ", "*")) if mass not in NO_UNIT else (1.0, 0.0)
-        prefix = PREFIXES.get(round(math.log10(factor[0]), 6)) if isinstance(factor, tuple) else None
+        factor = factor_of(f"({mass})*({unit})/s", usual.replace(" ", "*"))
+        if mass in NO_UNIT or not isinstance(factor, tuple):  # what the user calls a mass is none in these units
+            return usual
+        prefix = PREFIXES.get(round(math.log10(factor[0]), 6))
         return f"({mass}) ({unit})/s" if prefix is None else f"{prefix}{usual}"
 
     @property
