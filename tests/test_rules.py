@@ -49,7 +49,7 @@ def comparison(before: list[float], after: list[float], form: float = 0.0) -> Co
 
 
 @pytest.mark.parametrize(("was", "now", "share"), [(8.0, 2.0, 0.5), (5.0, 4.0, 0.125), (5.0, 5.0, 0.0)])
-def test_what_the_model_before_predicted_badly_is_no_merit_of_the_new_term(was: float, now: float, share: float) -> None:
+def test_what_was_predicted_badly_before_is_no_merit_of_the_new_term(was: float, now: float, share: float) -> None:
     c = comparison([8.0] * BLOCKS, [4.0] * BLOCKS)  # held out half goes
     c.before.cost[:], c.after.cost[:] = 50.0 * was, 50.0 * now  # where all blocks are fitted
     assert c.share_of_fall == pytest.approx(share)
