@@ -598,6 +598,25 @@ def test_between_a_body_and_one_without_a_mass_no_law_acts() -> None:
     assert not any("_minus_" in e.name for e in bound.effects)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("between", ["hold", "line"])
+def test_inputs_that_vary_smoothly_but_are_held_are_noted(between: str) -> None:
+    t = np.arange(0.0, 60.0, 0.2)
+    fine = np.arange(0.0, 60.0, 0.005)
+    u = np.sin(fine) + 0.7 * np.sin(2.3 * fine)
+    x = np.zeros(len(fine))
+    for k in range(len(fine) - 1):
+        x[k + 1] = x[k] + 0.005 * (u[k] - x[k]) / 0.5
+    columns = {"u": u[::40], "x": x[::40] + 0.002 * noise(len(t))}
+    system = System(
+        "room", "simulate", lambda x, u, p: (p.gain * u.u - x.x) / p.tau, inputs={"u": "V"}, states={"x": "V"},
+        outputs={"x": "V"}, parameters=[unknown("gain", 1.0, "-"), unknown("tau", 1.0, "s", low=0.01)],
+        places=["x"], between=between, without=["x_sensor.lag", "x_sensor.dead_time", "x_sensor.second_order_lag"],
+    )  # fmt: skip
+    notes = diagnose(Record("run", t, columns), system).to_dict()["notes"]
+    assert any('with between="line" the error is 0.' in n for n in notes) == (between == "hold")
+
+
 # ---- units -----------------------------------------------------------------------------------------------------------
 
 

@@ -6,7 +6,7 @@ The search is that of every model (`identification.workflow`); here is what seve
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,11 @@ from vaneloop.base.tables import read
 from vaneloop.identification.candidates import laws
 from vaneloop.identification.candidates.laws import HYSTERETIC
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
+from vaneloop.identification.regimes import agrees
 from vaneloop.identification.results import StageDiagnosis, answer_of, at_bound, interval_of, rms_of
 from vaneloop.identification.selection.diagnosis import Judged
 from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance
-from vaneloop.identification.settings import BOUND_PULL, DRIVES, NO_HELP, STARTS_LOADED
+from vaneloop.identification.settings import BOUND_PULL, DRIVES, LEAST_FALL, NO_HELP, STARTS_LOADED
 from vaneloop.identification.subsystem import Array, StageError
 from vaneloop.identification.user_models.bound_system import BoundSystem, rms_of_rows
 from vaneloop.identification.user_models.system import Record, System
@@ -145,7 +146,7 @@ class ByLog:
             if d.final.theta[i] == 0.0 and v0 != 0.0 and p.low == 0.0 and p.tolerance > 0:
                 was = f"it was {v0:.4g} {p.unit} while {laws} was missing"
                 self.notes.append(f"{p.name}: not needed any more, set to 0 ({was})")
-        self.notes += [*_loaded(bound, judge, d), *d.notes]
+        self.notes += [*_loaded(bound, judge, d), *_between(bound, judge, d), *d.notes]
         self.notes += [n for n in parameter_warnings(bound, judge, d) if n not in self.notes]
 
     def together(self) -> dict[str, dict[str, Array]]:
@@ -238,6 +239,23 @@ class ByLog:
 
 def _size(y: Array) -> float:
     return float(np.sqrt(np.nanmean(y**2))) if np.isfinite(y).any() and np.nanmax(np.abs(y)) > 0.0 else 1.0
+
+
+def _between(bound: BoundSystem, judge: LeastSquaresProblem, d: StageDiagnosis) -> list[str]:
+    """What it would change if the inputs ran straight between samples, where the model holds them: an input that varies
+    smoothly comes half a sample late, as no law of the machine's would have it.
+    """
+    s = bound.system
+    if s.kind != "simulate" or not s.holds or not s.inputs or agrees(d.excess, 1.0):
+        return []
+    bound.runner.system = replace(s, between="line")
+    other = judge.fit(d.final.effects, d.final.theta, 12)
+    bound.runner.system = s
+    before, after = (float(f.cost.sum()) / max(judge.n, 1) for f in (d.final, other))
+    if before - after < LEAST_FALL * (before - 1.0):
+        return []
+    share = np.sqrt(after / before)
+    return [f'inputs are held from sample to sample; with between="line" the error is {share:.2f} times as large']
 
 
 def _loaded(bound: BoundSystem, judge: LeastSquaresProblem, d: StageDiagnosis) -> list[str]:
