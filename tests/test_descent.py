@@ -259,5 +259,16 @@ def test_pairs_are_tried_with_the_two_effects_that_lead_beside_the_model_s(monke
     singles: Any = {n: SimpleNamespace(left=float(k)) for k, n in enumerate("abcd", 50)}
     singles["e"] = SimpleNamespace(left=100.0)  # earns nothing
     current: Any = SimpleNamespace(effects=("a",), left=40.0)
-    found = diagnose._on_another_way(search, current, singles)
-    assert tried == ["b", "c"] and found is not None and found.effects[0] == "b"
+    search.judge = None
+    monkeypatch.setattr(diagnose, "rms_of", lambda judge, fit: fit.left)
+    led: list[list[str]] = []
+    selection: Any = SimpleNamespace(search=search, singles=singles, ranked=list("abcde"))
+    selection.leaders = lambda ranked, many: led.append(ranked) or ["e", "b", "d"][: 2 * many]
+    found = diagnose._on_another_way(selection, current)
+    assert tried == ["b", "c"] and found is not None and found.effects[0] == "b" and not led
+    tried.clear()
+    current.left = 60.0  # more than half of the RMS: no name rests on it
+    criterion.left_out = {"c": "harms"}
+    search.best_of = lambda sets: [tried.append(sets[0][0]), SimpleNamespace(effects=sets[0], left=9.0)][1:]
+    found = diagnose._on_another_way(selection, current)
+    assert tried == ["e", "b", "d"] and found is not None and led == [list("abde")]

@@ -325,10 +325,10 @@ def test_effects_that_do_the_same_are_one_leader() -> None:
     x[2] = x[1]  # b does what a does
     search = search_of(linear(x, with_noise(14, x, 1.1, 3.0, 0.0, 2.0)), RelativeErrorAcceptance)
     singles = search.singles(["a", "b", "c"])
-    leaders = EffectSelection(search, singles, ["a", "b", "c"], [])._leaders
+    leaders = EffectSelection(search, singles, ["a", "b", "c"], []).leaders
     assert leaders(["a", "b", "c"]) == ["a", "c"] and leaders(["b", "c", "a"]) == ["b", "c"]
     vanes = search_of(linear(x, search.stage.measured))
-    assert EffectSelection(vanes, vanes.singles(["a", "b", "c"]), [], [])._leaders(["a", "b", "c"]) == ["a", "b", "c"]
+    assert EffectSelection(vanes, vanes.singles(["a", "b", "c"]), [], []).leaders(["a", "b", "c"]) == ["a", "b", "c"]
 
 
 def test_the_least_of_many_effects_with_fewest_is_chosen() -> None:

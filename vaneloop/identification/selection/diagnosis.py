@@ -20,7 +20,7 @@ from vaneloop.identification.onset import begun, change_point, onset_of, quiet_u
 from vaneloop.identification.regimes import agrees
 from vaneloop.identification.results import Candidate, StageDiagnosis, answer_of, found_of, rms_of
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
-from vaneloop.identification.selection.rules import BEGINS, Beginning, Decisions
+from vaneloop.identification.selection.rules import BEGINS, LEAVES_A_QUARTER, Beginning, Decisions, Remainder
 from vaneloop.identification.selection.search import Criterion, Search
 from vaneloop.identification.selection.stepwise import eliminate, stepwise
 from vaneloop.identification.selection.subsampled_search import excerpt_of, searched
@@ -279,7 +279,7 @@ class EffectSelection:
         if current.effects:
             return search.best_of([(*current.effects, m) for m in names])
         options = [f for m, f in self.singles.items() if m in names]
-        leaders = self._leaders([m for m in self.ranked if m in names])
+        leaders = self.leaders([m for m in self.ranked if m in names])
         alone = [f for f in options if criterion.accepts(current, f)]
         # of a model that roams, pairs are tried where no effect helps alone; else where the best one leaves more
         # than noise, and no other makes up for that beside it
@@ -295,13 +295,14 @@ class EffectSelection:
             options += search.best_of(list(itertools.combinations(leaders, 2)))
         return options
 
-    def _leaders(self, ranked: list[str]) -> list[str]:
-        """The leading effects; of a model that roams no two that do the same, such as a gain at either end: they count
-        as one.
+    def leaders(self, ranked: list[str], many: int = 1) -> list[str]:
+        """The leading effects, ``many`` times the usual number; of a model that roams no two that do the same.
+
+        A gain at either end, for example, counts as one.
         """
         search, criterion, out = self.search, self.search.criterion, list[str]()
         if not criterion.roams:
-            return ranked[: criterion.leaders]
+            return ranked[: many * criterion.leaders]
         errors: list[Array] = []
         for name in ranked:
             error = search.judge.errors(self.singles[name].theta[None])[0]
@@ -309,14 +310,14 @@ class EffectSelection:
             if all(rms > criterion.form for rms in apart):
                 out.append(name)
                 errors.append(error)
-            if len(out) == criterion.leaders:
+            if len(out) == many * criterion.leaders:
                 break
         return out
 
     def accepted(self, current: Fit, tried: Sequence[Fit]) -> list[Fit]:
         """Those that the criterion accepts; of none, the way by another leading effect."""
         ok = [f for f in tried if self.search.criterion.accepts(current, f)]
-        other = None if ok else _on_another_way(self.search, current, self.singles)
+        other = None if ok else _on_another_way(self, current)
         return ok if other is None else [other]
 
     def chosen(self, current: Fit, accepted: Sequence[Fit]) -> Fit:
@@ -350,20 +351,25 @@ def _least(search: Search, fits: list[Fit]) -> float:
     return min(rms_of(search.judge, f) for f in fits)
 
 
-def _on_another_way(search: Search, current: Fit, singles: dict[str, Fit]) -> Fit | None:
+def _on_another_way(selection: EffectSelection, current: Fit) -> Fit | None:
     """A pair with another leading effect than those of a model that grows no more, where that does better; None: none.
 
     What leads alone may make up for two effects at once: an upper tank that cannot rise, for its overflow and for the
-    limit of the lower one.
+    limit of the lower one. Where it leaves so much that it will not be named, what does nothing alone may lead, too.
     """
+    search, singles = selection.search, selection.singles
     criterion = search.criterion
     if not criterion.roams or not current.effects or len(current.effects) > 2:
         return None
     others = [m for m, f in singles.items() if criterion.accepts(search.base, f)]
-    others = [m for m in others if m not in (*current.effects, *criterion.left_out)]
     others.sort(key=lambda m: criterion.order(singles[m]))
+    was, now = (rms_of(search.judge, f) for f in (search.base, current))
+    if not LEAVES_A_QUARTER.verdict(Remainder(was, now, now, len(current.effects))).holds:
+        others = selection.leaders([m for m in selection.ranked if m not in criterion.left_out], 2)
+    else:
+        others = [m for m in others if m not in (*current.effects, *criterion.left_out)][:PAIR_LEADERS]
     names = [e.name for e in search.stage.effects if e.name not in criterion.left_out]
-    pairs = [f for o in others[:PAIR_LEADERS] for f in search.best_of([(o, m) for m in names if m != o])[:1]]
+    pairs = [f for o in others for f in search.best_of([(o, m) for m in names if m != o])[:1]]
     pairs = [f for f in pairs if set(f.effects) != set(current.effects) and criterion.accepts(current, f)]
     return min(pairs, key=criterion.order, default=None)
 
