@@ -167,6 +167,36 @@ def test_a_plan_s_files_stand_beside_it(tmp_path: Path) -> None:
     assert (p.model, p.plant) == (None, None) and plans.files_of_plan(p).keys() == {"scenario.my"}
 
 
+@pytest.mark.parametrize(
+    ("by", "why"),
+    [
+        ('"my: RUN"', ""),
+        ('"my"', ""),
+        ('" my : by 0.300 s "', ""),
+        ('"my: STANDBY"', r"requirement 'R-1': no claim of 'my' has the words 'STANDBY'; its claims: RUN by 0\.300 s"),
+        ('"mine"', r"requirement 'R-1': verified_by 'mine' must be one of the scenarios \['my'\]"),
+        ("", r"requirement\.0\.verified_by"),
+        ('"my"\n]\n[[requirement]]\nid = "R-1"\ntext = "Some text"\nverified_by = ["my"', r"its ids .* must differ"),
+        (
+            '"my"\n]\n[[requirement]]\nid = "R 2"\ntext = "Some text"\nverified_by = ["my"',
+            r"requirement\.1\.id \(='R 2'\)",
+        ),
+    ],
+)
+def test_a_requirement_is_verified_by_claims_of_the_plan_s_scenarios(tmp_path: Path, by: str, why: str) -> None:
+    (tmp_path / "my.toml").write_text(f'{SCENARIO}[[expect]]\nmode = "RUN"\nby = 0.3\nbecause = "it starts"\n')
+    (tmp_path / "plan.toml").write_text(
+        'title = "Made"\nscenarios = ["my.toml"]\n[vary]\n"a.x" = [0, 1]\n'
+        f'[[requirement]]\nid = "R-1"\ntext = "Some text"\nverified_by = [{by}]\n'
+    )
+    if not why:
+        (asked,) = load_plan(tmp_path / "plan.toml").requirement
+        assert asked.takes("my", "RUN by 0.300 s") and not asked.takes("other", "RUN by 0.300 s")
+        return
+    with pytest.raises(InputError, match=why):
+        load_plan(tmp_path / "plan.toml")
+
+
 @pytest.mark.parametrize(("source", "allowed"), [('log = "old.log"', False), ("begin = 0.1\nlength = 0.1", True)])
 def test_a_scenario_that_replays_a_file_is_refused(tmp_path: Path, source: str, allowed: bool) -> None:
     (tmp_path / "old.log").write_text("(0.0) can0 100#00\n")
@@ -699,8 +729,15 @@ def test_a_requirement_has_the_least_and_the_median_margin_of_all_machines() -> 
         {"margins": [claim("a", 0.3)]},
     ]
     search = {"margins": [claim("a", -0.5, value=-7.0), claim("new", -0.2, unit="N"), claim("b", None, True)]}
-    said = {r.expected: r for r in campaign._requirements(rows, search)}
+    asked = [{"id": "R-1", "text": "Some text", "verified_by": ["still: a"]},
+             {"id": "R-2", "text": "Some text", "verified_by": ["other", "still: new", "still: e"]}]  # fmt: skip
+    plan = plan_of(scenarios=["still", "other"], requirement=asked)
+    said = {r.expected: r for r in campaign._requirements(rows, search, plan, "still")}
     assert list(said) == ["a", "b", "rare", "new"]
+    assert [r.ids for r in said.values()] == [["R-1"], [], ["R-1", "R-2"], ["R-2"]]
+    odds = [(1, 4), (1, 2), (0, 1)]  # broken of those in which it was judged
+    assert [(r.low, r.high) for r in said.values()] == [*(campaign.interval(*o, 0.95) for o in odds), (0.0, 1.0)]
+    assert {tuple(r.ids) for r in campaign._requirements(rows, search, plan, "other")} == {("R-2",)}
     a, b, rare, new = said.values()
     assert (a.trials, a.broken, a.unit, a.least, a.share) == (4, 1, "deg", -2.0, -0.1)
     assert a.median == pytest.approx(0.25) and (a.searched, a.held) == (-7.0, False)
@@ -716,7 +753,7 @@ def test_a_requirement_has_the_least_and_the_median_margin_of_all_machines() -> 
     )
     assert (rare.trials, rare.broken, rare.least, rare.searched, rare.held) == (1, 0, 0.7, None, None)
     assert (new.trials, new.broken, new.unit, new.least, new.searched, new.held) == (0, 0, "N", None, -0.2, False)
-    assert [r.searched for r in campaign._requirements(rows, None)] == [None] * 3
+    assert [r.searched for r in campaign._requirements(rows, None, plan, "still")] == [None] * 3
 
 
 # ---- the whole, on made-up answers -----------------------------------------------------------------------------------

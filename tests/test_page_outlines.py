@@ -688,7 +688,24 @@ def campaign(groups: list[GroupView], allowed: float | None = None) -> CampaignV
         {"name": "play", "unit": "mm", "low": 0.010123456, "high": 0.02},
         {"name": "oil", "unit": "degC", "low": -40.0, "high": 60.0},
     ]
-    return CampaignView("Starts", "runs/1", "1.2.3", varied, 0.95, allowed, "Sobol", 7, groups)
+    texts = {"R-1": "The vane stays", "R-2": "Nothing verifies it", "R-3": "No fault comes"}
+    return CampaignView("Starts", "runs/1", "1.2.3", varied, 0.95, allowed, "Sobol", 7, groups, texts=texts)
+
+
+def test_a_requirement_holds_where_each_claim_that_verifies_it_does() -> None:
+    two = [
+        requirement(ids=["R-1"], high=0.04),
+        requirement(expected="no fault", broken=1, high=0.07, ids=["R-3", "R-1"]),
+    ]
+    view = campaign([group(requirements=two), group("b.c.d", requirements=two[:1])])
+    found = {r.id: r for r in view.traced}
+    assert [(r.holds, len(r.verified_by)) for r in found.values()] == [(False, 3), (False, 0), (False, 1)]
+    assert found["R-1"].verified_by[-1] == ("b.c.d", "vigv within 2 deg")
+    assert [r["id"] for r in view.json()["requirements"]] == ["R-1", "R-2", "R-3"] and "texts" not in view.json()
+    for allowed, holds in ((0.05, [False, False, False]), (0.07, [True, False, True])):
+        assert [r.holds for r in campaign(view.groups, allowed).traced] == holds
+    assert [r.holds for r in campaign([group(requirements=two[:1])]).traced] == [True, False, False]
+    assert not campaign([group(requirements=two[:1], lost=1)]).traced[0].holds
 
 
 def test_a_campaign_that_holds() -> None:

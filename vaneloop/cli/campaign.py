@@ -122,6 +122,10 @@ def _show(args: argparse.Namespace, view: CampaignView, search: int) -> None:
     interval = f"{100.0 * view.confidence:g} % interval"
     columns = ["combination", "", "failed", interval, "least margin", "found by", "reproduces"]
     terminal.print_table(args, view.title, columns, rows)
+    if view.texts:
+        traced = [[t.id, "holds" if t.holds else "FAILS", t.text, ", ".join(sorted({g for g, _ in t.verified_by}))]
+                  for t in view.traced]  # fmt: skip
+        terminal.print_table(args, "Requirements", ["id", "", "requirement", "verified in"], traced)
     for g in view.groups:
         for r in g.requirements:
             if r.fails:
@@ -157,7 +161,7 @@ def _write_junit(file: str, view: CampaignView) -> None:
         cases: list[tuple[str, str]] = []
         for r in g.requirements:
             text = f"broken in {r.broken} of {r.trials} machines, least margin {r.least} {r.unit}; {g.command}"
-            cases.append((r.expected, text if r.fails and view.allowed is None else ""))
+            cases.append((" ".join([*r.ids, r.expected]), text if r.fails and view.allowed is None else ""))
         text = f"failed {g.failed} of {g.trials} machines, {g.low:.3g} to {g.high:.3g}; {g.lost} without an answer; "
         text += f"worst case {'reproduces' if g.same else 'does not reproduce'}: {g.command}"
         text += "".join(f"; failed machine does not reproduce: {f.command}" for f in g.failures if not f.same)

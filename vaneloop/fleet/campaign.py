@@ -69,7 +69,7 @@ def begin(file: str | Path, out: str | Path, limit: float, device: str = "auto")
             plans.group_machine(files, g, model_at(files, g, quantities, [corner] * len(quantities)))
     if device == "cuda":
         demand_gpu(files, plans.groups(plan), quantities)
-    told = plan.model_dump(mode="json", exclude={"title", "confidence", "allowed", "saved"})
+    told = plan.model_dump(mode="json", exclude={"title", "confidence", "allowed", "saved", "requirement"})
     for c in (
         told["calibration"] + told["firmware"]
     ):  # where the files lay is no part of the campaign; their contents are
@@ -187,15 +187,17 @@ def judge(plan: Plan, quantities: list[Varied], folder: Folder, told: Callable[[
         first, total = _indices(plan, quantities, folder, g, rows, among)
         shown.append(GroupView(
             g.name, g.scenario, g.calibration, g.firmware, len(done), len(rows) - len(done), failed, low, high,
-            _requirements(done, nearest), shares, points, plans.values_at(quantities, worst["point"]), least, by_search,
-            runs, worst["seen"], worst["state_hash"], str(saved), command, same and agreed, first, total, alone,
-            failures, rare, "" if rare or plan.sampling != "subset" else _why_counted(failed, len(done)),
+            _requirements(done, nearest, plan, g.scenario), shares, points,
+            plans.values_at(quantities, worst["point"]), least, by_search, runs, worst["seen"], worst["state_hash"],
+            str(saved), command, same and agreed, first, total, alone, failures, rare,
+            "" if rare or plan.sampling != "subset" else _why_counted(failed, len(done)),
         ))  # fmt: skip
         told((k + 1) / len(all_groups))
     return CampaignView(
         plan.title, str(folder.path), folder.job["version"], [vars(q) for q in quantities], plan.confidence,
         plan.allowed, plan.sampling, plan.seed, shown, simulated,
-        [f"{why}; the processor's lanes ran {n:,} machines" for why, n in notes.items()],
+        [f"{why.rstrip('.')}; the processor's lanes ran {n:,} machines" for why, n in notes.items()],
+        {r.id: r.text for r in plan.requirement},
     )  # fmt: skip
 
 
@@ -235,9 +237,11 @@ def _close(a: float | None, b: float | None) -> bool:
     return a == b or (a is not None and b is not None and math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-9))
 
 
-def _requirements(done: list[dict[str, Any]], search: dict[str, Any] | None) -> list[Requirement]:
+def _requirements(
+    done: list[dict[str, Any]], search: dict[str, Any] | None, plan: Plan, scenario: str
+) -> list[Requirement]:
     """Every claim over all trials: how often it was broken, its least and its median margin, and that of the worst
-    machine beyond them.
+    machine beyond them; the interval of the probability that it is broken; which requirements of the plan it verifies.
     """
     by: dict[str, list[dict[str, Any]]] = {}
     for r in done:
@@ -252,10 +256,13 @@ def _requirements(done: list[dict[str, Any]], search: dict[str, Any] | None) -> 
         share = [m["share"] for m in rows if m["share"] is not None]
         s = found.get(expected)
         unit = next((m["unit"] for m in [*rows, *([s] if s else [])] if m["unit"]), "")
+        broken = sum(not m["held"] for m in rows)
+        low, high = interval(broken, len(rows), plan.confidence) if rows else (0.0, 1.0)
         out.append(Requirement(
-            expected, len(rows), sum(not m["held"] for m in rows), unit, min(value, default=None),
+            expected, len(rows), broken, unit, min(value, default=None),
             float(np.median(value)) if value else None, min(share, default=None),
-            None if s is None else s["value"], None if s is None else bool(s["held"]),
+            None if s is None else s["value"], None if s is None else bool(s["held"]), low, high,
+            [r.id for r in plan.requirement if r.takes(scenario, expected)],
         ))  # fmt: skip
     return out
 

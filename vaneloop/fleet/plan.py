@@ -19,6 +19,11 @@
     [[firmware]]
     name = "mine"
     controller = "mine.so"                        # as --controller takes it
+
+    [[requirement]]                               # traced to the claims that verify it
+    id = "VGV-014"
+    text = "The vanes do not move by more than 1 deg while the ECU is silent"
+    verified_by = ["demand_stops: vigv"]          # a scenario's claims with these words; without words all of them
 """
 
 from __future__ import annotations
@@ -43,8 +48,8 @@ from vaneloop.base.tables import Finite, Table, read
 from vaneloop.verbs.machine import Machine
 
 __all__ = [
-    "LEAST", "Group", "Plan", "Varied", "as_options", "base_model", "draw", "files_of_plan", "group_machine", "groups",
-    "load_plan", "model_of", "scenario_of", "values_at", "varied", "varied_by",
+    "LEAST", "Group", "Plan", "Varied", "Verified", "as_options", "base_model", "draw", "files_of_plan",
+    "group_machine", "groups", "load_plan", "model_of", "scenario_of", "values_at", "varied", "varied_by",
 ]  # fmt: skip
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,60}")
@@ -66,6 +71,26 @@ class Choice(Table):
         return name
 
 
+class Verified(Table):
+    """A requirement: its identifier, its text, and what verifies it: ``SCENARIO``, all claims of a scenario, or
+    ``SCENARIO: words``, those with these words.
+    """
+
+    id: Annotated[str, Field(pattern=r"^[A-Za-z0-9_./-]{1,60}$")]
+    text: Annotated[str, Field(min_length=4)]
+    verified_by: Annotated[list[str], Field(min_length=1)]
+
+    def parts(self) -> Iterator[tuple[str, str]]:
+        """Each scenario that verifies it, and the words of its claims; "": all."""
+        for one in self.verified_by:
+            scenario, _, words = one.partition(":")
+            yield scenario.strip(), words.strip()
+
+    def takes(self, scenario: str, claim: str) -> bool:
+        """Whether a claim of a scenario verifies it."""
+        return any(scenario == one and words in claim for one, words in self.parts())
+
+
 LEAST = 5  # samples that a search begins with
 LEAST_OF_LEVEL = 250  # samples of a level of a subset simulation: chains begin from a tenth of them
 MOST_OF_LEVEL = 10_000  # one worker runs the levels
@@ -83,6 +108,7 @@ class Plan(Table):
     confidence   of the intervals
     saved        failed samples of each group that are saved as files, the worst first
     allowed      greatest failure probability that the interval's upper end may reach; without, any failure is one
+    requirement  requirements with identifiers, each traced to the claims that verify it
     seed         of the draw and of the search
     """
 
@@ -102,6 +128,7 @@ class Plan(Table):
                     Field(min_length=1, max_length=100)]  # fmt: skip
     calibration: list[Choice] = [Choice(name="shipped")]
     firmware: list[Choice] = [Choice(name="shipped")]
+    requirement: list[Verified] = []
 
     @model_validator(mode="after")
     def _fits(self) -> Plan:
@@ -119,6 +146,12 @@ class Plan(Table):
         for stem in stems:
             if not _NAME.fullmatch(stem):
                 raise ValueError(f"scenarios: a file's name (={stem!r}) must be letters, digits, - and _")
+        ids = [r.id for r in self.requirement]
+        if len(set(ids)) < len(ids):
+            raise ValueError(f"requirement: its ids (={ids}) must differ")
+        for r in self.requirement:
+            if unknown := next((s for s, _ in r.parts() if s not in stems), None):
+                raise ValueError(f"requirement {r.id!r}: verified_by {unknown!r} must be one of the scenarios {stems}")
         if self.search and self.samples < LEAST:
             raise ValueError(f"samples (={self.samples}) must be at least {LEAST} where a search begins with them")
         if self.sensitivity > self.samples:
@@ -177,6 +210,14 @@ def load_plan(file: str | Path) -> Plan:
     scenarios = [s if s in known and not (folder / s).is_file() else str(at(s)) for s in plan.scenarios]
     for s in scenarios:
         made = load_scenario(s)
+        claims = [claim.words for claim in made.expect]
+        for r in plan.requirement:
+            for words in (words for scenario, words in r.parts() if scenario == Path(s).stem):
+                if not any(words in claim for claim in claims):
+                    raise InputError(
+                        f"{file}: requirement {r.id!r}: no claim of {Path(s).stem!r} has the words {words!r}; its "
+                        f"claims: {'; '.join(claims)}"
+                    )
         if any(isinstance(a, Replay) and a.log for a in made.inject):
             raise InputError(f"{file}: scenarios: {Path(s).stem!r} replays a log file, which a campaign does not take")
     own = plan.plant if plan.plant is None or not (folder / plan.plant).is_file() else at(plan.plant)

@@ -11,7 +11,7 @@ from vaneloop.pages.figures import Line, Panel, overlay, ranking
 from vaneloop.pages.page import Page
 from vaneloop.pages.series import distribution
 
-__all__ = ["CampaignView", "FailedMachine", "GroupView", "Rare", "Requirement", "campaign_page"]
+__all__ = ["CampaignView", "FailedMachine", "GroupView", "Rare", "Requirement", "Traced", "campaign_page"]
 
 DIGITS = 6  # of limits: a tolerance may be a thousandth
 
@@ -24,6 +24,8 @@ class Requirement:
     least, median    margin in ``unit``; None: nothing measures it
     share            the least as a share (`hil.inject.margin`)
     searched, held   margin of the case that the search ended with, and whether it held there; None: no search
+    low, high        interval of the probability that it is broken
+    ids              identifiers of the plan's requirements that it verifies
     """
 
     expected: str
@@ -35,6 +37,9 @@ class Requirement:
     share: float | None
     searched: float | None
     held: bool | None
+    low: float = 0.0
+    high: float = 1.0
+    ids: list[str] = field(default_factory=list)
 
     @property
     def fails(self) -> bool:
@@ -152,11 +157,24 @@ class GroupView:
 
 
 @dataclass(frozen=True)
+class Traced:
+    """A requirement of the plan: its identifier and text, whether it holds in every combination that verifies it, and
+    the combinations with their claims.
+    """
+
+    id: str
+    text: str
+    holds: bool
+    verified_by: list[tuple[str, str]]
+
+
+@dataclass(frozen=True)
 class CampaignView:
     """What a campaign says: its groups, and what was varied (name, unit, low, high).
 
     simulated_s  s of samples, indices, levels and search by what ran them: a GPU's name, "cpu" (lanes), "bus"
     notes        what ran elsewhere than it was asked to, and why
+    texts        requirements of the plan: identifier -> text
     """
 
     title: str
@@ -170,6 +188,21 @@ class CampaignView:
     groups: list[GroupView]
     simulated_s: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    texts: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def traced(self) -> list[Traced]:
+        """Each requirement of the plan with what verifies it."""
+        out = []
+        for name, text in self.texts.items():
+            by = [(g, r) for g in self.groups for r in g.requirements if name in r.ids]
+            holds = all(not g.lost and self.holds(r) for g, r in by)
+            out.append(Traced(name, text, holds and bool(by), [(g.name, r.expected) for g, r in by]))
+        return out
+
+    def holds(self, claim: Requirement) -> bool:
+        """Whether a claim holds: in every run, or as surely as the plan allows."""
+        return not claim.fails if self.allowed is None else claim.high <= self.allowed
 
     @property
     def simulated_on(self) -> str:
@@ -200,6 +233,8 @@ class CampaignView:
     def json(self) -> dict[str, Any]:
         """The answer as plain data."""
         out = {"schema": 1, **asdict(self), "passed": all(self.passed(g) for g in self.groups)}
+        out["requirements"] = [asdict(r) for r in self.traced]
+        out.pop("texts")
         for row, g in zip(out["groups"], self.groups, strict=True):
             row |= {"passed": self.passed(g), "failures_not_saved": g.failed - len(g.failures)}
             row.pop("points"), row.pop("shares")
@@ -229,6 +264,17 @@ def campaign_page(view: CampaignView, command: str = "") -> Page:
         [[g.name, view.passed(g), g.trials, g.lost, g.failed, g.probability, g.low, g.high, g.least,
           g.found_by] for g in view.groups],
     )  # fmt: skip
+    if view.texts:
+        page.section(
+            "Requirements",
+            "Each with the combinations and claims that verify it. Low and high are the interval of the probability "
+            "that a machine breaks the claim.",
+        )
+        page.table(
+            ["id", "requirement", "holds", "combination", "claim", "judged in", "broken in", "low", "high"],
+            [[t.id, t.text, t.holds, g.name, r.expected, r.trials, r.broken, r.low, r.high]
+             for t in view.traced for g in view.groups for r in g.requirements if t.id in r.ids],
+        )  # fmt: skip
     page.section("What was varied", "Each uniformly and independently of the others, between these limits.")
     rows = [[q["name"], q["low"], q["high"], q["unit"]] for q in view.varied]
     page.table(["quantity", "low", "high", "unit"], rows, digits=DIGITS)
@@ -244,13 +290,14 @@ def campaign_page(view: CampaignView, command: str = "") -> Page:
 def _group(page: Page, view: CampaignView, g: GroupView) -> None:
     page.section(
         f"{g.scenario}, calibration {g.calibration}, firmware {g.firmware}",
-        "Requirements of the scenario. A margin is the distance from being broken, in the unit of the claim; a claim "
-        "without a margin is only held or broken.",
+        "Requirements of the scenario. Low and high are the interval of the probability that a machine breaks it. A "
+        "margin is the distance from being broken, in the unit of the claim; a claim without a margin is only held or "
+        "broken.",
     )
-    columns = ["requirement", "holds", "judged in", "broken in", "least margin", "median margin", "unit",
+    columns = ["requirement", "holds", "judged in", "broken in", "low", "high", "least margin", "median margin", "unit",
                "margin after search"]  # fmt: skip
-    page.table(columns, [[r.expected, not r.fails, r.trials, r.broken, r.least, r.median, r.unit or "–", r.searched]
-                         for r in g.requirements])  # fmt: skip
+    page.table(columns, [[" ".join([*r.ids, r.expected]), view.holds(r), r.trials, r.broken, r.low, r.high, r.least,
+                          r.median, r.unit or "–", r.searched] for r in g.requirements])  # fmt: skip
     for why, n in g.alone.items():
         page.text(f"{n} of {g.trials} machines ran one by one on the lockstep bus, not in lanes: {why}.")
     if g.rare:
