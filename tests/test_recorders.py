@@ -242,6 +242,11 @@ def test_what_a_last_digit_hides_is_one_error_as_long_as_it_stands():
         Logger(1000, stale=(0.001, 6)),
         Logger(1000, stale=(0.001, 34)),
         Logger(100, stale=(0.001, 34)),
+        Logger(50, window=0.02),  # current and stroke alike: the stroke lies half a row behind, which no valve does
+        Logger(25, window=0.04),
+        Logger(500, filter=(1, 200.0), offset={"bus": 0.0109}),
+        Logger(200, offset={"bus": 0.0166}, stale=(0.001, 34)),
+        Logger(1000, resolution=1.0, hum=(50.0, 0.5), offset={"bus": 0.0029}),
     ],
 )
 def test_no_subsystem_of_a_clean_log_fails_whatever_its_recorder_rounds_and_repeats(logger: Logger, tmp_path: Path):

@@ -2086,6 +2086,7 @@ def test_what_laws_do_to_each_log_and_parameters_that_are_not_needed_any_more_ar
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(by_log, "_loaded", lambda *of: ["loaded"])
+    monkeypatch.setattr(by_log, "_between", lambda *of: ["held"])
     monkeypatch.setattr(by_log, "parameter_warnings", lambda *of: ["again", "warned"])
     ps = [
         Parameter("k", 1.0, "N", 0.0, 9.0, 5.0), Parameter("zero", 1.0, "N", 0.0, 9.0, 5.0),
@@ -2104,7 +2105,8 @@ def test_what_laws_do_to_each_log_and_parameters_that_are_not_needed_any_more_ar
         "before", f"lag hardly helps on b: error with it over error without it is {limit:.2f}",
         "lag does not help on c: error with it over error without it is 0.98",
         "lag does not help on d: error with it over error without it is 1.23",
-        "zero: not needed any more, set to 0 (it was 1.235 N while lag, play was missing)", "loaded", "again", "warned",
+        "zero: not needed any more, set to 0 (it was 1.235 N while lag, play was missing)", "loaded", "held", "again",
+        "warned",
     ]  # fmt: skip
 
 

@@ -33,6 +33,7 @@ BESIDE = "a file of the fleet's run folder that is read only when it is there wh
 CACHE = "a cache: what is cut counts as none, and bringing each of hundreds of files to the disk takes 10 ms"
 REASONS = {
     ("hil/bus/broker.py", "open"): PIPE,
+    ("vaneloop/fleet/together.py", "open"): "a lock, which has no content",
     ("vaneloop/verbs/answer.py", "savefig"): "to memory",
     ("hil/calibrate/prepare.py", "write_bytes"): PRIVATE,
     ("hil/calibrate/slave.py", "save"): "the memory's, which writes through `write_all`",

@@ -36,6 +36,7 @@ from plant.effects import CURVES
 from plant.layout import C_OF, CURVE_ROWS, MOST_CURVES
 from vaneloop.base.signals import SIDES, UNITS
 from vaneloop.base.vanes import VANES, same_stages
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
 from vaneloop.identification.settings import (
     CHAIN_MEMORY,
     CURRENT_DRAWS,
@@ -580,12 +581,14 @@ def _rows(t: Array, gaps: Gaps, names: Sequence[str], running: Array | None, mos
 
 def _slow_current(driven: Driven) -> str:
     """Which of `SLOW_CURRENTS` moves the piston as logged clearly better than the mean since the row before; "":
-    none.
+    none. Each with the nominal parameters that suit it: what they are off by hides a current that is late.
     """
 
     def misfit(current: Array) -> float:
         stage = actuator_stage(driven._replace(columns={**driven.columns, "i_cmd": current}))
-        return float(rms(stage, stage.measured - stage.run(stage.neutral()[None])[0])[0])
+        floor = noise_floor(stage.t, stage.measured[0] - stage.run(stage.neutral()[None])[0, 0])
+        judge = LeastSquaresProblem(stage, np.array([max(floor, LEAST_FLOOR["actuator"])]))
+        return float(np.sqrt(judge.mean_squares(judge.errors(recalibrate(judge).theta[None])[0])[0]) * judge.floor[0])
 
     i = driven.columns["i_cmd"]
     misfits = {what: misfit(mean_of(i)) for what, mean_of in SLOW_CURRENTS.items()}
