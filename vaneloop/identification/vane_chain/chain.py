@@ -580,20 +580,24 @@ def _rows(t: Array, gaps: Gaps, names: Sequence[str], running: Array | None, mos
 
 
 def _slow_current(driven: Driven) -> str:
-    """Which of `SLOW_CURRENTS` moves the piston as logged clearly better than the mean since the row before; "":
-    none. Each with the nominal parameters that suit it: what they are off by hides a current that is late.
+    """Which of `SLOW_CURRENTS` moves the piston as logged clearly better than the mean since the row before, with the
+    nominal parameters of the table or with those that suit it: what they are off by may hide a current that is late,
+    and may make up for it. "": none.
     """
 
-    def misfit(current: Array) -> float:
+    def misfits(current: Array) -> Array:
         stage = actuator_stage(driven._replace(columns={**driven.columns, "i_cmd": current}))
-        floor = noise_floor(stage.t, stage.measured[0] - stage.run(stage.neutral()[None])[0, 0])
-        judge = LeastSquaresProblem(stage, np.array([max(floor, LEAST_FLOOR["actuator"])]))
-        return float(np.sqrt(judge.mean_squares(judge.errors(recalibrate(judge).theta[None])[0])[0]) * judge.floor[0])
+        off = stage.measured - stage.run(stage.neutral()[None])[0]
+        floor = max(noise_floor(stage.t, off[0]), LEAST_FLOOR["actuator"])
+        judge = LeastSquaresProblem(stage, np.array([floor]))
+        suited = judge.mean_squares(judge.errors(recalibrate(judge).theta[None])[0])
+        return np.array([float(rms(stage, off)[0]), floor * float(np.sqrt(suited[0]))])
 
     i = driven.columns["i_cmd"]
-    misfits = {what: misfit(mean_of(i)) for what, mean_of in SLOW_CURRENTS.items()}
-    what = min(misfits, key=lambda k: misfits[k])
-    return what if misfits[what] < OTHER_CURRENT * misfit(i) else ""
+    as_mean = misfits(i)
+    shares = {what: float(np.min(misfits(mean_of(i)) / as_mean)) for what, mean_of in SLOW_CURRENTS.items()}
+    what = min(shares, key=lambda k: shares[k])
+    return what if shares[what] < OTHER_CURRENT else ""
 
 
 def _never_changes(values: Array) -> bool:
