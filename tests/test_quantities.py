@@ -106,7 +106,7 @@ def logged(true: Any, output: str, unit: str, inputs: dict[str, str], p: tuple[f
     ("true", "nominal", "output", "unit", "inputs", "p", "name"),
     [
         (radiating, plate, "hot", "degC", {"heater": "W", "room": "degC"}, (2.0, 0.01), "hot.radiation_to_room"),
-        (rubbing, stuck, "speed", "rad/s", {"volts": "V"}, (2.0, 0.5), "speed.coulomb"),
+        (rubbing, stuck, "speed", "rad/s", {"volts": "V"}, (2.0, 0.5), "speed.smooth_coulomb"),
     ],
 )
 def test_what_a_state_loses_is_named_by_its_physics(
