@@ -357,9 +357,9 @@ def test_keys_are_what_they_say(keys: list[bytes], told: list[str], monkeypatch:
 
 def group(**more: Any) -> SimpleNamespace:
     rule = SimpleNamespace(
-        expected="stays in RUN", broken=2, trials=9, least=-0.5, unit="s", fails=True,
+        expected="stays in RUN", broken=2, trials=9, least=-0.5, unit="s", fails=True, ids=["R-7"],
     )  # fmt: skip
-    held = SimpleNamespace(expected="no fault", broken=0, trials=9, least=0.5, unit="s", fails=False)
+    held = SimpleNamespace(expected="no fault", broken=0, trials=9, least=0.5, unit="s", fails=False, ids=[])
     given: dict[str, Any] = {
         "name": "gust", "failed": 2, "trials": 9, "low": 0.03, "high": 0.6, "least": -0.5, "found_by": "search",
         "same": False, "reproduces": False, "rare": None, "counted": "", "failures": [], "saved_failures": lambda: "",
@@ -376,7 +376,7 @@ def test_a_campaign_is_told_and_written_for_junit(tmp_path: Path, capsys: Said) 
             group(name="calm", failed=0, requirements=[], alone={}, lost=0, runs=4, same=True, reproduces=True),
         ],
         passed=lambda g: g.name == "calm", confidence=0.95, title="a campaign", allowed=None,
-        sentence=lambda: "so it is", simulated_s={"cpu": 1.0}, simulated_on="Simulated: 1 s", notes=["no GPU"],
+        sentence=lambda: "so it is", simulated_s={"cpu": 1.0}, simulated_on="Simulated: 1 s", notes=["no GPU"], texts={},
     )  # fmt: skip
     campaign._show(args(), view, 5)
     said = lines(capsys)
@@ -398,7 +398,7 @@ def test_a_campaign_is_told_and_written_for_junit(tmp_path: Path, capsys: Said) 
     assert first.attrib == {"name": "gust", "tests": "3", "failures": "2", "errors": "0", "skipped": "0"}
     assert second.attrib == {"name": "calm", "tests": "1", "failures": "0", "errors": "0", "skipped": "0"}
     assert [(c.get("name"), len(c)) for c in first] == [
-        ("stays in RUN", 1),
+        ("R-7 stays in RUN", 1),
         ("no fault", 0),
         ("the combination passes", 1),
     ]
