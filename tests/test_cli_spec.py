@@ -376,7 +376,8 @@ def test_a_campaign_is_told_and_written_for_junit(tmp_path: Path, capsys: Said) 
             group(name="calm", failed=0, requirements=[], alone={}, lost=0, runs=4, same=True, reproduces=True),
         ],
         passed=lambda g: g.name == "calm", confidence=0.95, title="a campaign", allowed=None,
-        sentence=lambda: "so it is", simulated_s={"cpu": 1.0}, simulated_on="Simulated: 1 s", notes=["no GPU"], texts={},
+        sentence=lambda: "so it is", simulated_s={"cpu": 1.0}, simulated_on="Simulated: 1 s", notes=["no GPU"],
+        texts={},
     )  # fmt: skip
     campaign._show(args(), view, 5)
     said = lines(capsys)
