@@ -249,8 +249,10 @@ def _between(bound: BoundSystem, judge: LeastSquaresProblem, d: StageDiagnosis) 
     if s.kind != "simulate" or not s.holds or not s.inputs or agrees(d.excess, 1.0):
         return []
     bound.runner.system = replace(s, between="line")
-    other = judge.fit(d.final.effects, d.final.theta, 12)
-    bound.runner.system = s
+    try:
+        other = judge.fit(d.final.effects, d.final.theta, 12)
+    finally:
+        bound.runner.system = s
     before, after = (float(f.cost.sum()) / max(judge.n, 1) for f in (d.final, other))
     if before - after < LEAST_FALL * (before - 1.0):
         return []

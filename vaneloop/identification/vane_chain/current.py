@@ -195,12 +195,11 @@ def samples_of(ticks: Array, samples: int) -> Array:
 
 def taken(ticks: Array, samples: int) -> dict[str, Array]:
     """What each way of a logger takes of the ticks since the row before, float64[rows, 10]: their mean, first, and
-    others by their names.
+    others by their names. Samples of all ten ticks are their mean.
     """
     mean = ticks.mean(axis=1)
-    return {
-        "": mean, SAMPLED: samples_of(ticks, samples), BEFORE: mean + 0.1 * (np.roll(ticks[:, -1], 1) - ticks[:, -1])
-    }  # fmt: skip
+    some = {SAMPLED: samples_of(ticks, samples)} if samples < ticks.shape[1] else {}
+    return {"": mean, **some, BEFORE: mean + 0.1 * (np.roll(ticks[:, -1], 1) - ticks[:, -1])}
 
 
 def other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Calibration, samples: int) -> str:
@@ -223,7 +222,7 @@ def other_current(t: Array, c: dict[str, Array], law: Array, run: Array, cal: Ca
         return float(np.median(np.sqrt(np.maximum(square - mean**2, 0.0)))) if most.any() else 0.0
 
     ways = taken(law, samples)
-    what = min((SAMPLED, BEFORE), key=lambda k: misfit(ways[k]))
+    what = min((k for k in ways if k), key=lambda k: misfit(ways[k]))
     if misfit(ways[what]) >= OTHER_CURRENT * misfit(ways[""]):
         return ""
     c[LOGGED_CURRENT] = c["i_cmd"]
