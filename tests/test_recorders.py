@@ -104,6 +104,29 @@ def test_clocks_of_an_excerpt_are_set_right_and_those_that_are_known_are_not_sou
     assert not any(s.agrees for s in compare_stages([build_chain(file, pieces=pieces, late={}).stage("servo")]))
 
 
+@pytest.mark.parametrize(("stroke", "speed"), [(0.02, 0.0), (-0.03, 0.02), (0.0, -0.03)])
+def test_zeros_of_a_recorder_are_set_right(stroke: float, speed: float):
+    log, high = rows(SEED), {"x_lvdt": stroke, "n_r": speed}
+    log = log | {name: log[name] + by for name, by in high.items()}
+    file = Log("zeros", {k: Channel(log["t"], v) for k, v in log.items() if k != "t"}, [])
+    chain = build_chain(file)
+    found = {one.channels[0]: one.zero for one in chain.late["linkage"]}
+    assert found == pytest.approx({name: by for name, by in high.items() if by}, rel=0.1)
+    assert sum("in the file than in the controller" in n for n in chain.notes) == len(found)
+    assert all(s.agrees for s in compare_stages(chain.stages))
+    assert compare_stages(build_chain(file, late=chain.late).stages) == compare_stages(chain.stages)
+
+
+@pytest.mark.parametrize(
+    "hidden",
+    [("schedule_error", {"offset": 2e-4}), ("lvdt_bias", {"bias": 3e-4}), ("controller_gain_error", {"factor": 1.1})],
+)
+def test_what_the_controller_has_seen_too_is_no_zero_of_the_recorder(hidden: tuple[str, dict[str, float]]):
+    log = rig.simulate(rig.manoeuvre(SEED, DURATION), firmware(), [rig.Hidden(*hidden)], seed=SEED).log
+    chain = build_chain(Log("machine", {k: Channel(log["t"], v) for k, v in log.items() if k != "t"}, []))
+    assert not any(one.zero for late in chain.late.values() for one in late)
+
+
 def test_one_clock_stays_as_it_is():
     assert not [n for n in build_chain(Log("clean", {k: Channel(rows(SEED)["t"], v) for k, v in rows(SEED).items()
                                                      if k != "t"}, [])).notes if "stand" in n]  # fmt: skip
@@ -247,6 +270,8 @@ def test_what_a_last_digit_hides_is_one_error_as_long_as_it_stands():
         Logger(500, filter=(1, 200.0), offset={"bus": 0.0109}),
         Logger(200, offset={"bus": 0.0166}, stale=(0.001, 34)),
         Logger(1000, resolution=1.0, hum=(50.0, 0.5), offset={"bus": 0.0029}),
+        Logger(100, hum=(400.0, 0.5)),  # which stands still in these rows: the zeros of all channels
+        Logger(200, hum=(400.0, 0.5), window=0.005, drift=3e-5),
     ],
 )
 def test_no_subsystem_of_a_clean_log_fails_whatever_its_recorder_rounds_and_repeats(logger: Logger, tmp_path: Path):

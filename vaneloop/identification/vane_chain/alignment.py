@@ -1,9 +1,9 @@
-"""The clocks of a log: by how much the samples of some channels stand late in the file.
+"""The clocks and zeros of a log: by how much the samples of some channels stand late in the file, or read high.
 
-Who records the bus, the controller and the vanes with three devices has three clocks and three filters. What that does
-to a log is no physics, and it is worked out before the search looks for any. Only what the machine cannot do counts as
-the recorder's, and each subsystem has its own offsets, against the channels that it explains: what comes in frames,
-each of one of the controller's ticks, is never worked out between two of them.
+Who records the bus, the controller and the vanes with three devices has three clocks, three filters and three zeros.
+What that does to a log is no physics, and it is worked out before the search looks for any. Only what the machine
+cannot do counts as the recorder's, and each subsystem has its own offsets, against the channels that it explains: what
+comes in frames, each of one of the controller's ticks, is never worked out between two of them.
 
 | subsystem | what stands late | why no machine does that |
 |---|---|---|
@@ -11,6 +11,15 @@ each of one of the controller's ticks, is never worked out between two of them.
 | demand | rotor speed against the stroke demand | an answer before its cause |
 | engine | rotor speed and all else against its demand | lags bend a response, they do not move it |
 | linkage | all vane angles alike against the stroke; also more and more | each sensor has a lag of its own |
+
+A reading that is high in the file alone is the recorder's, too: the firmware's law and tables say what the controller
+has read.
+
+| subsystem | what reads high | what says so |
+|---|---|---|
+| servo | stroke | the current's integral runs at another rate than the error of the stroke |
+| demand | rotor speed | the stroke demand lies on the tables at another speed |
+| engine | rotor speed, where no demand is judged | it settles at another speed than the demanded one |
 """
 
 from __future__ import annotations
@@ -24,6 +33,7 @@ import numpy as np
 
 from hil.logs import Log
 from plant import chain
+from vaneloop.base.signals import UNITS
 from vaneloop.base.vanes import VANES
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
@@ -31,12 +41,12 @@ from vaneloop.identification.settings import COLOUR, EXPLAINED, LATE, LOW_PASS_R
 from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.vane_chain.current import LOGGED_CURRENT, law_of, taken
 from vaneloop.identification.vane_chain.low_pass import AS_LOGGED, LOW_PASSES, LowPass
-from vaneloop.identification.vane_chain.resample import Grid, first_row, last_digit
+from vaneloop.identification.vane_chain.resample import OF_SUBSYSTEM, Grid, first_row, last_digit
 from vaneloop.identification.vane_chain.subsystem_data import VANES_LATE, Made
 
 __all__ = [
     "Late", "LateIn", "aligned", "demand_of", "driving", "explains", "fits", "late_in_controller", "late_vanes",
-    "on_rows", "passed_by", "vanes_late",
+    "on_rows", "passed_by", "vanes_late", "zeros_in_controller",
 ]  # fmt: skip
 
 Sampled = tuple[Array, ...]  # a row's current by each of the ways in which a logger may take it from its ten ticks
@@ -51,6 +61,7 @@ class Late(NamedTuple):
 
     passed  low-pass of the analogue channels: of a demand, which has not passed it, it makes the delay, or part of it;
             of analogue channels that stand where they belong, all have passed it
+    zero    border unit, by which the file reads higher than the controller has
     """
 
     channels: tuple[str, ...]
@@ -58,9 +69,13 @@ class Late(NamedTuple):
     drift: float = 0.0
     middle: float = 0.0
     passed: LowPass = AS_LOGGED
+    zero: float = 0.0
 
     def text(self) -> str:
         """What is said of it."""
+        if self.zero:
+            by = f"{abs(self.zero):.3g} {UNITS[self.channels[0]]} {'higher' if self.zero > 0.0 else 'lower'}"
+            return f"{self.channels[0]}: reads {by} in the file than in the controller; moved"
         if self.passed.kind and not self.seconds:
             return f"{', '.join(self.channels)}: have passed {self.passed.text()}; the model's have, too"
         way = "late" if self.seconds >= 0.0 else "early"
@@ -80,11 +95,14 @@ class Late(NamedTuple):
 
 def aligned(log: Log, late: Sequence[Late], grid: Grid) -> Log:
     """The log with its strokes where they belong, and the vane angles `on_rows` of its raster."""
-    late = [one for one in late if one.seconds or one.drift]
+    late = [one for one in late if one.seconds or one.drift or one.zero]
     channels = dict(log.channels)
     for one in late:
-        for name in (c for c in one.channels if c in log.channels and c not in DRIVING):
+        for name in (c for c in one.channels if c in log.channels and (one.zero or c not in DRIVING)):
             c = channels[name]
+            if one.zero:
+                channels[name] = replace(c, values=c.values - one.zero)
+                continue
             moved = grid.start + one.times(c.t - grid.start)
             channels[name] = replace(c, t=c.t - on_rows(log, one, grid) if name in VANES else moved)
     return replace(log, channels=channels) if late else log
@@ -104,7 +122,7 @@ def driving(t: Array, columns: dict[str, Array], late: Sequence[Late]) -> dict[s
     """The columns of a raster with the speeds where they belong: between their rows by straight lines, for a stage is
     driven by them.
     """
-    moved = {name: one for one in late for name in one.channels if name in columns and name in DRIVING}
+    moved = {n: one for one in late if not one.zero for n in one.channels if n in columns and n in DRIVING}
     return columns | {name: _shifted(t, columns[name], one.besides) for name, one in moved.items()}
 
 
@@ -151,6 +169,41 @@ def late_in_controller(stages: Sequence[Stage]) -> LateIn:
     if passed.kind and "linkage" in of:
         out["linkage"] = out.get("linkage", ()) + _both_behind(of["linkage"], passed)
     return {name: late for name, late in out.items() if late}
+
+
+def zeros_in_controller(stages: Sequence[Stage]) -> LateIn:
+    """Strokes and rotor speeds that read higher in the file than in the controller, where the stages of a log fail."""
+    of = _judged(stages)
+    speed = next((name for name in ("demand", "engine") if name in of), "")
+    zeros = []
+    for name, channel in (("servo", "x_lvdt"), (speed, "n_r")):
+        if name in of and not fits(of[name]) and (zero := _zero(of[name], channel)):
+            zeros.append(Late((channel,), 0.0, zero=zero))
+    return dict.fromkeys(OF_SUBSYSTEM, tuple(zeros)) if zeros else {}
+
+
+def _zero(stage: Stage, channel: str) -> float:
+    """By how much a channel reads high, border unit; 0: that does not explain the stage's error, or the effect that
+    looks most like it, tables whose strokes are off alike, does so better.
+    """
+    t, driven = stage.t, stage.made.driven  # type: ignore[attr-defined]
+    c, rate = driven.columns, np.zeros(0)
+    if stage.name == "servo":
+        rate = law_of(np.zeros(len(t)), np.ones(len(t)), driven.calibration)
+
+    def of(zero: Array) -> dict[str, Array]:
+        return {"law": c["law"] - zero[0] * rate} if stage.name == "servo" else {channel: c[channel] - zero[0]}
+
+    zero, before, after = _fit(stage, _moving(stage, of), 1, most=np.inf)
+    if not explains(stage, before, after):
+        return 0.0
+    rival = "schedule_error"
+    if rival in stage.index():
+        judge = LeastSquaresProblem(stage, np.asarray(stage.floor))
+        shifted = judge.fit((rival,), stage.neutral(), 4)
+        if judge.mean_squares(judge.errors(shifted.theta[None])[0]).sum() <= after.sum():
+            return 0.0
+    return float(zero[0])
 
 
 def late_vanes(stages: Sequence[Stage]) -> LateIn:

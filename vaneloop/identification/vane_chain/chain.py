@@ -60,6 +60,7 @@ from vaneloop.identification.vane_chain.alignment import (
     late_vanes,
     passed_by,
     vanes_late,
+    zeros_in_controller,
 )
 from vaneloop.identification.vane_chain.candidates import OF_STROKE, reversals, room_for
 from vaneloop.identification.vane_chain.current import (
@@ -173,7 +174,7 @@ def build_chain(
     chain = _build(log, plant, calibration, present, grid, pieces, draws, known)
     known_clocks = late is not None or framed or chain.plant.sides > 1
     noisy = expect_stationary_noise(chain.stages) if known_clocks else []
-    for find in () if known_clocks else (late_in_controller, late_vanes):
+    for find in () if known_clocks else (zeros_in_controller, late_in_controller, late_vanes):
         found = find(chain.stages)
         if found:
             known = {**known, **{name: known.get(name, ()) + more for name, more in found.items()}}
@@ -277,7 +278,7 @@ def _build(
     chains, why = [], None
     for (rows, moved), names in together.items() or {(tuple(pieces), ()): []}.items():
         # a recorder's lateness and that of the bus look alike
-        theirs = DELAYS if any(BUS.intersection(one.channels) for one in moved) else ()
+        theirs = DELAYS if any(BUS.intersection(one.channels) for one in moved if not one.zero) else ()
         try:
             chains.append(_chain(log, grid, rows, names, machine, tables, (*present, *theirs), draws, moved))
         except LogError as e:
