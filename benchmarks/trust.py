@@ -1,6 +1,6 @@
 """Probabilities that come true: fitted to blind answers, and judged on others.
 
-    python -m benchmarks.trust fit effects.parquet laws.parquet        # coefficients for selection/calibration.py
+    python -m benchmarks.trust fit effects.parquet laws.parquet        # coefficients for results.py
     python -m benchmarks.trust judge effects2.parquet laws2.parquet    # reliability, Brier score, 90 % set of names
 
 The files are results of `benchmarks.hidden_effect` and `benchmarks.hidden_law`. Fit and judgement must not see the same
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.blind import share
-from vaneloop.identification.selection.calibration import terms, trust
+from vaneloop.identification.results import terms, trust
 from vaneloop.identification.settings import TRUST_COEFFICIENTS
 
 RIDGE = 1.0  # observations that a coefficient of 0 is worth: few answers must not make a name certain

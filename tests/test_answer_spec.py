@@ -32,9 +32,9 @@ from vaneloop.identification.results import (
     recalibrated,
     rms_of,
     rms_per_output,
+    trust,
     weigh,
 )
-from vaneloop.identification.selection.calibration import trust
 from vaneloop.identification.selection.diagnosis import extend_stage
 from vaneloop.identification.selection.rules import PROBABLE
 from vaneloop.identification.settings import LIKELY

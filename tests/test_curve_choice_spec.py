@@ -25,13 +25,7 @@ from vaneloop.identification.selection.likelihood_acceptance import rival_nats
 from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance, score
 from vaneloop.identification.selection.rules import Decisions
 from vaneloop.identification.subsystem import Array
-from vaneloop.identification.unmodelled import (
-    curve_choice,
-    learning,
-    parametric_substitution,
-    screening,
-    surface_search,
-)
+from vaneloop.identification.unmodelled import curve_choice, learning, screening, surface_search
 from vaneloop.identification.unmodelled.closed_form_fits import (
     Product,
     _factors,
@@ -565,7 +559,7 @@ def test_formulas_in_a_curve_s_place_are_made_once(monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize(("level", "enough"), [(0.0, True), (0.5, True), (-0.89, True), (-0.91, False), (-2.0, False)])
 def test_a_mean_goes_back_into_the_parameter_that_had_it(level: float, enough: bool) -> None:
     numbers, own = np.array([3.0, 7.0]), np.array([1.0, 2.0])
-    assert parametric_substitution.takes_mean_back(level, numbers, own, 1) == enough
+    assert curve_choice.takes_mean_back(level, numbers, own, 1) == enough
     assert abs(LEAST_PARAMETER_LEFT - 0.1) < 1e-12
     if enough:
         assert own[1] == pytest.approx(2.0 * (1.0 + level)) and own[0] == 1.0 and numbers[1] == 7.0
@@ -577,7 +571,7 @@ def test_a_formula_is_held_against_its_curve_on_held_out_data_and_each_test_log(
     learner.ground.tests = frozenset("vw")
     curve, formula = tried("u", 1.0), tried("f", 1.1)
     curve.fit.free, formula.fit.free = np.arange(12), np.arange(4)  # type: ignore[misc]
-    held, tests = parametric_substitution.more_left(learner, curve, formula, [curve])
+    held, tests = curve_choice.more_left(learner, curve, formula, [curve])
     assert held == pytest.approx(np.log(1.1) + 8.0 * PER_PARAMETER) and tests == [-0.2, 0.3]
 
 
@@ -592,20 +586,18 @@ def test_a_formula_is_the_law_where_it_does_as_well(
     f = said("line", 1.0, 1.0, a=2.0)
     now = tried("f", 1.03)
     curve = tried("u", 1.0, formulas=[(f, tried("alone"))])
-    monkeypatch.setattr(
-        parametric_substitution, "_in_place", lambda ground, now_, k, c, f_, alone: (now, replace(f_, text="2 u"))
-    )
-    monkeypatch.setattr(parametric_substitution, "more_left", lambda learner, before, t, among: (held, tests))
-    monkeypatch.setattr(parametric_substitution, "goes_on", lambda *_: (-3.0, 3.0))
+    monkeypatch.setattr(curve_choice, "_in_place", lambda ground, now_, k, c, f_, alone: (now, replace(f_, text="2 u")))
+    monkeypatch.setattr(curve_choice, "more_left", lambda learner, before, t, among: (held, tests))
+    monkeypatch.setattr(curve_choice, "goes_on", lambda *_: (-3.0, 3.0))
     law = SimpleNamespace(formulas=[f], spoken=None)
-    monkeypatch.setattr(parametric_substitution, "replace", lambda of, **more: SimpleNamespace(**vars(of) | more))
-    at, laws = parametric_substitution.spoken(ordering(), [curve], [law])  # type: ignore[list-item]
+    monkeypatch.setattr(curve_choice, "replace", lambda of, **more: SimpleNamespace(**vars(of) | more))
+    at, laws = curve_choice.spoken(ordering(), [curve], [law])  # type: ignore[list-item]
     assert (at is now) == spoken and (laws[0].spoken is not None) == spoken
     if spoken:
         assert laws[0].spoken.text == "2 u" and laws[0].reach == (-3.0, 3.0) and laws[0].formulas[0].text == "2 u"  # type: ignore[union-attr]
         assert laws[0].error_after == pytest.approx(1.03)
     slips = tried("stops_of_u", formulas=[(f, tried("alone"))])
-    assert parametric_substitution.spoken(ordering(), [slips], [law])[0] is slips  # type: ignore[list-item]
+    assert curve_choice.spoken(ordering(), [slips], [law])[0] is slips  # type: ignore[list-item]
 
 
 # ---- near a noise that is known --------------------------------------------------------------------------------------

@@ -21,8 +21,8 @@ from vaneloop.identification.results import rms_of
 from vaneloop.identification.subsystem import Array
 from vaneloop.identification.unmodelled import (
     curve_candidates,
+    curve_choice,
     learning,
-    parametric_substitution,
     regressors,
     screening,
     surface_search,
@@ -43,10 +43,10 @@ from vaneloop.identification.unmodelled.curve_candidates import (
     surface_of,
     with_curves,
 )
+from vaneloop.identification.unmodelled.curve_choice import as_the_law
 from vaneloop.identification.unmodelled.fitted_candidate import FittedCandidate
 from vaneloop.identification.unmodelled.learned_law import law_of, surface_law_of
 from vaneloop.identification.unmodelled.learning import CurveSearch
-from vaneloop.identification.unmodelled.parametric_substitution import as_the_law
 from vaneloop.identification.unmodelled.regressors import Quantity, _acting, _differences, quantities
 from vaneloop.identification.unmodelled.screening import screened, smoothed
 from vaneloop.identification.unmodelled.spectral_lines import Course, Lines, _driven, _repeats
@@ -136,7 +136,7 @@ def test_a_formula_is_fitted_in_its_curve_s_place_and_becomes_the_law() -> None:
     assert scores[0] < min(scores) + 0.02
     law = law_of(ground, (nothing.judge, nothing.fit), t)
     assert law.formulas and law.formulas == likely(t, t.formulas or [], rms_of(nothing.judge, nothing.fit))
-    now, (said,) = parametric_substitution.spoken(learner, [t], [law])
+    now, (said,) = curve_choice.spoken(learner, [t], [law])
     assert said.spoken is not None and said.spoken.form == "cube" and now is not t
     assert said.spoken.numbers["a"] == pytest.approx(0.05, rel=0.02)
     low, high = law.x[0], law.x[-1]
@@ -194,14 +194,14 @@ def test_a_level_goes_back_into_the_parameter() -> None:
     assert not t.candidate.mean and rms_of(t.judge, t.fit) < 1.2
     formula, alone = next((f, a) for f, a in fitted_formulas(learner.ground, t) if f.form == "line")
     assert formula.level != 0.0  # it comes less its mean
-    got = parametric_substitution._in_place(learner.ground, t, 0, t.candidate, formula, alone)
+    got = curve_choice._in_place(learner.ground, t, 0, t.candidate, formula, alone)
     assert got is not None
     now, said = got
     # 2 u + 0.3 u (w - 2) = a u (1 + b w) with a = 1.4, b = 0.3 / 1.4
     assert now.fit.theta[0] == pytest.approx(1.4, rel=0.02) and said.numbers["a"] == pytest.approx(0.3 / 1.4, rel=0.05)
     assert said.level == 0.0 and said.error == rms_of(now.judge, now.fit) < 1.2
     gone = replace(formula, level=-0.95)
-    assert parametric_substitution._in_place(learner.ground, t, 0, t.candidate, gone, alone) is None
+    assert curve_choice._in_place(learner.ground, t, 0, t.candidate, gone, alone) is None
 
 
 # ---- a surface and its product ---------------------------------------------------------------------------------------
@@ -597,20 +597,20 @@ def test_a_formula_that_was_learned_with_another_one_is_told_beside_it(monkeypat
         return [(Formula("line", "u", {"a": 1.0}, 1.0, 1), better)]
 
     better = tried("f", 1.2)
-    monkeypatch.setattr(parametric_substitution, "_formulas_beside", beside)
+    monkeypatch.setattr(curve_choice, "_formulas_beside", beside)
     learner = ordering()
-    parametric_substitution.tell_each_by_its_formula(learner, first, second)
+    curve_choice.tell_each_by_its_formula(learner, first, second)
     assert made == [(first, second), (second, better)] and first.formulas and second.formulas
     made.clear()
     better = tried("f", 1.6)  # leaves more than both curves
-    parametric_substitution.tell_each_by_its_formula(learner, first, second)
+    curve_choice.tell_each_by_its_formula(learner, first, second)
     assert made == [(first, second)]
     better, learner.speaks = tried("f", 1.2), False
     made.clear()
-    parametric_substitution.tell_each_by_its_formula(learner, first, second)
+    curve_choice.tell_each_by_its_formula(learner, first, second)
     assert made == [(first, second)]
     made.clear()
-    parametric_substitution.tell_each_by_its_formula(learner, tried("stops_of_u"), second)
+    curve_choice.tell_each_by_its_formula(learner, tried("stops_of_u"), second)
     assert made == []
 
 

@@ -16,8 +16,7 @@ import pytest
 
 from tests.test_search_limits import SIDES, fit_of, judge_of
 from vaneloop.identification import workflow
-from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known
-from vaneloop.identification.least_squares.levenberg_marquardt import carries
+from vaneloop.identification.least_squares.levenberg_marquardt import NOT_KNOWN, Known, carries
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection import diagnosis as diagnose
 from vaneloop.identification.subsystem import Effect, Parameter, Stage

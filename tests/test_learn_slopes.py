@@ -13,7 +13,7 @@ from hypothesis import strategies as some
 from vaneloop.base.curve import on_even, on_table
 from vaneloop.identification import Record, System, unknown
 from vaneloop.identification.least_squares import levenberg_marquardt as steps
-from vaneloop.identification.least_squares.broyden import NOT_KNOWN, BroydenJacobian, Known, LatestSlopes
+from vaneloop.identification.least_squares.levenberg_marquardt import NOT_KNOWN, BroydenJacobian, Known, LatestSlopes
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.subsystem import Array, Effect, Parameter, Stage
 from vaneloop.identification.unmodelled.curve_candidates import candidates, with_curves

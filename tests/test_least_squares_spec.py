@@ -15,7 +15,7 @@ from scipy.optimize import least_squares, lsq_linear
 
 from tests.conftest import examples
 from vaneloop.identification import Effect, Parameter, Stage, StageError
-from vaneloop.identification.least_squares.broyden import BroydenJacobian, Known, LatestSlopes, bounded_step
+from vaneloop.identification.least_squares.levenberg_marquardt import BroydenJacobian, Known, LatestSlopes, bounded_step
 from vaneloop.identification.least_squares.levenberg_marquardt import carries as carries_along
 from vaneloop.identification.least_squares.noise import correlation_of, floor_deviation, most_floor, tolerance
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, covariance, finished, recalibrate
@@ -351,7 +351,7 @@ def test_carried_slopes_say_what_the_last_step_did_and_change_as_little_as_that_
 
 
 def test_slopes_are_kept_by_the_place_and_the_columns_and_the_oldest_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vaneloop.identification.least_squares.broyden.KEPT_SLOPES", 20)
+    monkeypatch.setattr("vaneloop.identification.least_squares.levenberg_marquardt.KEPT_SLOPES", 20)
     kept, error = LatestSlopes(), np.ones((1, 4))
     places = [np.array([float(i), 0.0]) for i in range(4)]
     free = np.array([0, 3])

@@ -20,10 +20,9 @@ from tests.conftest import examples
 from vaneloop.identification import Effect, Parameter, Stage, StageError
 from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
-from vaneloop.identification.results import StageDiagnosis, rms_of
+from vaneloop.identification.results import StageDiagnosis, rms_of, trust
 from vaneloop.identification.selection import likelihood_acceptance as likelihood
 from vaneloop.identification.selection import subsampled_search
-from vaneloop.identification.selection.calibration import trust
 from vaneloop.identification.selection.diagnosis import _search, diagnose_stage, extend_stage
 from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
 from vaneloop.identification.selection.relative_error_acceptance import RelativeErrorAcceptance, score, structure

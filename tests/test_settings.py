@@ -21,7 +21,7 @@ KINDS = ("principle", "physics", "numerics", "benchmark", "budget of work", "jud
 LAYOUT = {
     "candidates/laws.py": {"MEMORY", "PARAMETERS"},  # columns of a law's state and parameters
     "user_models/terms.py": {"INPUT", "OUTPUT", "COLUMN", "NOTHING", "HOW"},  # numbers of quantities and of places
-    "user_models/user_laws.py": {"MOST_PARAMETERS", "MOST_MEMORY", "FIRST_CODE"},  # room of users' laws; their codes
+    "user_models/system.py": {"MOST_PARAMETERS", "MOST_MEMORY", "FIRST_CODE"},  # room of users' laws; their codes
     "unmodelled/curve_candidates.py": {"JUMP"},  # index of an amplitude that is of no function of the basis
     "unmodelled/fitted_candidate.py": {"MEASURED"},  # rank in an order
     "unmodelled/spectral_lines.py": {"ALONE"},  # one harmonic, beside the threshold of a line

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.trust import Name, fitted, judged, names_of
+from vaneloop.identification import results as module
 from vaneloop.identification import settings
-from vaneloop.identification.selection import calibration as module
-from vaneloop.identification.selection.calibration import trust
+from vaneloop.identification.results import trust
 from vaneloop.identification.settings import TRUST_COEFFICIENTS
 
 LEFT, FALL, SHARE = st.floats(0.5, 1e4), st.floats(0.5, 1e4), st.floats(0.0, 1.0)

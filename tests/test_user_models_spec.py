@@ -53,8 +53,8 @@ from vaneloop.identification.user_models.experiment import (
 )
 from vaneloop.identification.user_models.injection_points import _size, nominal_course
 from vaneloop.identification.user_models.motion import differentiated_to, highest_frequency, low_pass, motion, smoothed
+from vaneloop.identification.user_models.system import Law
 from vaneloop.identification.user_models.user_code import UserCode, _ends, cannot, load_system
-from vaneloop.identification.user_models.user_laws import Law
 
 # docs/settings.md
 LEAST_SAMPLES, LEAST_POINTS, INPUT_NAN = 50, 12, 0.2

@@ -25,9 +25,8 @@ if TYPE_CHECKING:
     from hil.logs import Channel, Log, read_log, write_log
     from vaneloop.base.errors import InputError
     from vaneloop.identification.subsystem import Parameter
-    from vaneloop.identification.user_models.system import Record, System, unknown
+    from vaneloop.identification.user_models.system import Law, Record, System, unknown
     from vaneloop.identification.user_models.user_code import load_system
-    from vaneloop.identification.user_models.user_laws import Law
     from vaneloop.verbs.learn import learn
     from vaneloop.verbs.machine import Machine
     from vaneloop.verbs.replay import replay
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
 _HOME = {
     "Channel": "hil.logs",
     "InputError": "vaneloop.base.errors",
-    "Law": "vaneloop.identification.user_models.user_laws",
+    "Law": "vaneloop.identification.user_models.system",
     "Log": "hil.logs",
     "Machine": "vaneloop.verbs.machine",
     "Parameter": "vaneloop.identification.subsystem",

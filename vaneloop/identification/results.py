@@ -9,15 +9,17 @@ import numpy as np
 
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.onset import Onset
-from vaneloop.identification.selection.calibration import trust
 from vaneloop.identification.selection.rules import Decision
-from vaneloop.identification.settings import NINETY
+from vaneloop.identification.settings import NINETY, TRUST_COEFFICIENTS, TRUST_MOST_FALL, TRUST_MOST_LEFT
 from vaneloop.identification.subsystem import Array, Parameter, Stage
 
 __all__ = [
-    "Candidate", "Estimate", "Found", "StageDiagnosis", "answer_of", "at_bound", "estimates", "found_of",
-    "interval_of", "parameters_of", "recalibrated", "rms_of", "rms_per_output", "weigh",
+    "Candidate", "Estimate", "Evidence", "Found", "StageDiagnosis", "answer_of", "at_bound", "estimates",
+    "found_of", "interval_of", "parameters_of", "recalibrated", "rms_of", "rms_per_output", "terms", "trust",
+    "weigh",
 ]  # fmt: skip
+
+Evidence = Mapping[str, float]  # left, fall, share: see `terms`
 
 
 @dataclass
@@ -41,7 +43,7 @@ class Candidate:
 class Found:
     """An effect named as missing.
 
-    probability  that it is what is missing, `identification.selection.calibration`; that of each rival: `probabilities`
+    probability  that it is what is missing (`trust`); that of each rival: `probabilities`
     fits         the stage's fit with it, and with each that was tried in its place
     shares       of each of these: how much speaks for it among them
     fall         error without it over the error with it
@@ -86,7 +88,7 @@ class StageDiagnosis:
     nearest: list[str] = field(default_factory=list)  # where the verdict is unknown: the effects that come nearest
     refused: list[str] = field(default_factory=list)  # and why they are no answer, in words
     gain: str = "log-likelihood gain on held-out data"  # what `Candidate.nats` counts
-    criterion: str = ""  # what an effect had to do to be named: `identification.selection.calibration.COEFFICIENTS`
+    criterion: str = ""  # what an effect had to do to be named: a name of `TRUST_COEFFICIENTS`
     notes: list[str] = field(default_factory=list)  # what decided between rivals, what was left out, in words
     decisions: list[Decision] = field(default_factory=list, repr=False)  # every acceptance rule's verdict
     onset: Onset | None = None  # when the effects begin; None: they act all along
@@ -95,6 +97,33 @@ class StageDiagnosis:
 def rms_of(judge: LeastSquaresProblem, fit: Fit) -> float:
     """RMS of the held-out error, in noise floors."""
     return float(np.sqrt(max(fit.held_out.sum(), 0.0) / max(judge.n, 1)))
+
+
+# ---- How far a name can be trusted: the probability that the law which is missing is the one named or among its rivals
+#
+# The search's own shares say which of the laws *that it tried* explains the log best. They cannot say how often none of
+# them is it. That is learnt from blind answers (`benchmarks/hidden_effect.py`, `hidden_law.py`), by a logistic
+# regression (Platt 1999) on what an answer shows of itself: the more is left, the less the law does and the nearer
+# others come, the more its name is doubted. `python -m benchmarks.trust` fits and judges it.
+
+
+def terms(evidence: Evidence) -> tuple[float, float, float, float]:
+    """The regression's terms of one answer.
+
+    left   error that the stage's best model leaves on its worst output, noise floors
+    fall   error of the model without the law over the error with it
+    share  of all that was tried in its place, what the law and its rivals have, 0 to 1
+    """
+    left, fall = (
+        float(np.clip(evidence[k], 1.0, most)) for k, most in (("left", TRUST_MOST_LEFT), ("fall", TRUST_MOST_FALL))
+    )
+    return 1.0, float(np.log(left)), float(np.log(fall)), float(np.clip(evidence["share"], 0.0, 1.0)) - 1.0
+
+
+def trust(criterion: str, evidence: Evidence) -> float:
+    """Probability that what is missing is the law named, or one of its rivals."""
+    score = sum(b * x for b, x in zip(TRUST_COEFFICIENTS[criterion], terms(evidence), strict=True))
+    return float(1.0 / (1.0 + np.exp(-score)))
 
 
 def weigh(d: StageDiagnosis) -> None:

@@ -137,7 +137,7 @@ class Stage:
     begins    float64[sets, parameters] values from which a fit may begin beside the nominal ones, which a model without
               what it lacks may have lost its way to; None: there are none
     quick     a run costs next to nothing: slopes are taken at every start
-    carries   slopes are carried along the steps of a fit (`identification.least_squares.broyden`)
+    carries   slopes are carried along the steps of a fit (`identification.least_squares.levenberg_marquardt`)
     excerpt   function from ascending sample indices, in whole windows, to the same stage on these samples only: a long
               log is searched on an excerpt, and the answer confirmed on the whole; None: always searched whole
     counted   function from such indices to bool[samples]: which of them count in an excerpt of them, where not all do

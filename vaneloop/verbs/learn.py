@@ -22,10 +22,10 @@ from vaneloop.identification.selection.rules import decisions_json
 from vaneloop.identification.settings import HARM, LEAST_FALL, UNKNOWN
 from vaneloop.identification.unmodelled.closed_form_fits import reach_of
 from vaneloop.identification.unmodelled.curve_candidates import SHAPES, SurfaceCandidate, UserModelCandidates, on_logs
+from vaneloop.identification.unmodelled.curve_choice import as_the_law, spoken
 from vaneloop.identification.unmodelled.fitted_candidate import Outcome
 from vaneloop.identification.unmodelled.learned_law import LearnedSurface, law_of, surface_law_of
 from vaneloop.identification.unmodelled.learning import CurveSearch
-from vaneloop.identification.unmodelled.parametric_substitution import as_the_law, spoken
 from vaneloop.identification.unmodelled.problem import above_the_noise
 from vaneloop.identification.unmodelled.python_law import python_law
 from vaneloop.identification.user_models.by_log import ByLog, as_given, bind

@@ -1,9 +1,15 @@
 """The steps of a fit: Levenberg-Marquardt with bounds, three dampings at a time.
 
-Linearisation are simulated, a parameter set for each free parameter, or carried on from the last step
-(`identification.least_squares.broyden`). A step by carried slopes costs the three trials alone. They are simulated anew
-where such a step brings much less than they promised, or less for its cost than the last step by simulated ones; and a
-descent does not end before simulated slopes say so.
+Slopes are simulated, a parameter set for each free parameter, or carried on from the last step, which then costs the
+three trials alone. They are simulated anew where such a step brings much less than they promised, or less for its cost
+than the last step by simulated ones; and a descent does not end before simulated slopes say so.
+
+A step d of the free parameters changes the errors from e to e'. The slopes J, by which they should have changed by
+-J d, are off by w = e' - e + J d; so J is changed as little as makes it say what this step did (Broyden 1965):
+
+    J' = J - v w,   v = M d / (d M d)
+
+M, the diagonal of the normal matrix, measures a parameter by what it does to the errors, so that units do not matter.
 """
 
 from __future__ import annotations
@@ -13,19 +19,113 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from vaneloop.identification.least_squares.broyden import NOT_KNOWN, BroydenJacobian, Known, bounded_step
 from vaneloop.identification.settings import (
     CARRIED_STEP,
     CARRIED_VALUES,
     DAMPING_TIMES,
     EVIDENCE,
+    KEPT_SLOPES,
     LEAST_STEP_FALL,
     MOST_DAMPED,
     PROMISE_KEPT,
 )
 from vaneloop.identification.subsystem import Array, Stage
 
-__all__ = ["Begin", "End", "carries", "levenberg_marquardt"]
+__all__ = [
+    "NOT_KNOWN", "Begin", "BroydenJacobian", "End", "Known", "LatestSlopes", "bounded_step", "carries",
+    "levenberg_marquardt",
+]  # fmt: skip
+
+
+class Known(NamedTuple):
+    """Minus derivatives of the errors by parameters in their scales: of these columns of theta, a row each."""
+
+    columns: Array
+    rows: Array
+
+    def fits(self, size: int) -> bool:
+        """Whether any are known, and of so many errors."""
+        return len(self.columns) > 0 and self.rows.size == len(self.columns) * size
+
+
+NOT_KNOWN = Known(np.zeros(0, dtype=int), np.zeros((0, 0)))
+
+
+class BroydenJacobian:
+    """Errors and minus their slopes at one place of a descent; their gradient and normal matrix.
+
+    error   whitened, float64[outputs, samples]
+    slopes  minus the derivative by each free parameter in its scale, float64[free, outputs, samples]
+    """
+
+    def __init__(self, error: Array, slopes: Array):
+        """Begin with slopes that were simulated at ``error``."""
+        self.error, self.slopes = error.ravel(), slopes.reshape(len(slopes), error.size)
+        self.normal = self.slopes @ self.slopes.T
+
+    @property
+    def gradient(self) -> Array:
+        """What a step gains first, by each parameter: half the fall of the sum of squares."""
+        return np.asarray(self.slopes @ self.error)
+
+    def moved(self, step: Array, error: Array) -> None:
+        """Note that a ``step`` of the free parameters, in their scales, has led to this ``error``."""
+        way = np.diag(self.normal) * step
+        size = float(way @ step)
+        if size > 0.0:
+            way /= size
+            off = error.ravel() - self.error + step @ self.slopes
+            across = self.slopes @ off
+            both = np.outer(way, across)
+            self.normal += float(off @ off) * np.outer(way, way) - both - both.T
+            self.slopes -= np.outer(way, off)
+        self.error = error.ravel().copy()
+
+
+class LatestSlopes:
+    """Errors and slopes where fits have ended last, which may be gone on with."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[bytes, bytes], tuple[Array, Array]] = {}
+
+    def put(self, theta: Array, free: Array, error: Array, slopes: Array) -> None:
+        """Keep these; the oldest go."""
+        self._kept[theta.tobytes(), free.tobytes()] = error, slopes
+        while sum(rows.size for _, rows in self._kept.values()) > KEPT_SLOPES:
+            del self._kept[next(iter(self._kept))]
+
+    def get(self, theta: Array, free: Array) -> tuple[Array, Array] | None:
+        """Copies of error and slopes; None where they are not kept."""
+        found = self._kept.get((theta.tobytes(), free.tobytes()))
+        return (found[0], found[1].copy()) if found else None
+
+    def of(self, theta: Array, free: Array, before: float = np.inf) -> Known:
+        """The slopes by those free parameters that stand before a column, where they are kept."""
+        found = self._kept.get((theta.tobytes(), free.tobytes()))
+        return Known(free[free < before], found[1][free < before]) if found else NOT_KNOWN
+
+
+def bounded_step(a: Array, g: Array, low: Array, high: Array) -> Array:
+    """The step that minimises step a step / 2 - g step within bounds, near enough: what runs into one stops, the rest
+    is solved again.
+
+    A step that is only cut off at the bounds is no descent where parameters can stand in for each other.
+    """
+    step = np.zeros(len(g))
+    moves = np.ones(len(g), dtype=bool)
+    for _ in range(len(g)):
+        if moves.all():
+            step = np.linalg.solve(a, g)
+        else:
+            step[moves] = np.linalg.solve(a[np.ix_(moves, moves)], g[moves] - a[np.ix_(moves, ~moves)] @ step[~moves])
+        beyond = moves & ((step < low) | (step > high))
+        if not beyond.any():
+            break
+        step[beyond] = np.clip(step[beyond], low[beyond], high[beyond])
+        moves &= ~beyond
+        if not moves.any():
+            break
+    return step
 
 
 Linear = tuple[Array, Array, Array]  # costs, gradients and normals of the blocks

@@ -19,8 +19,15 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known, LatestSlopes
-from vaneloop.identification.least_squares.levenberg_marquardt import Begin, End, carries, levenberg_marquardt
+from vaneloop.identification.least_squares.levenberg_marquardt import (
+    NOT_KNOWN,
+    Begin,
+    End,
+    Known,
+    LatestSlopes,
+    carries,
+    levenberg_marquardt,
+)
 from vaneloop.identification.least_squares.residuals import ResidualCache, normalise_residuals, whiten_unlogged
 from vaneloop.identification.settings import (
     DIFFERENCE,

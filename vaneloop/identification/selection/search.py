@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from vaneloop.identification.least_squares.broyden import NOT_KNOWN, bounded_step
+from vaneloop.identification.least_squares.levenberg_marquardt import NOT_KNOWN, bounded_step
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, Led, Task, finished, recalibrate
 from vaneloop.identification.selection.screening import Linearisation, along, followed, onward, out_of, within
 from vaneloop.identification.selection.stepwise import eliminate

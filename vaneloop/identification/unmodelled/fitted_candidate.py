@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from vaneloop.identification.candidates.closed_forms import Formula
-from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known, bounded_step
+from vaneloop.identification.least_squares.levenberg_marquardt import NOT_KNOWN, Known, bounded_step
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.selection.rules import Decision
 from vaneloop.identification.settings import LEAST_FALL, LEAST_OF_NOISE, LEAST_SETTLED, NATS, SURELY

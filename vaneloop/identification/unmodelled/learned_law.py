@@ -13,7 +13,7 @@ from plant.model import Second
 from vaneloop.base.curve import POINTS, SIDE
 from vaneloop.base.durations import within_no_period
 from vaneloop.identification.candidates.closed_forms import Formula, values_of
-from vaneloop.identification.least_squares.broyden import bounded_step
+from vaneloop.identification.least_squares.levenberg_marquardt import bounded_step
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import rms_of
 from vaneloop.identification.settings import BAND, BAND_DRAWS, SHOWN_PLACES, SHOWN_SAMPLES, VISITED_BINS

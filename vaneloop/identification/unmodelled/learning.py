@@ -57,6 +57,7 @@ from vaneloop.identification.unmodelled.curve_choice import (
     instead_of,
     leaves,
     said_first,
+    tell_each_by_its_formula,
     without_memory,
 )
 from vaneloop.identification.unmodelled.fitted_candidate import (
@@ -72,7 +73,6 @@ from vaneloop.identification.unmodelled.fitted_candidate import (
     surely_more,
     without_its_lag,
 )
-from vaneloop.identification.unmodelled.parametric_substitution import tell_each_by_its_formula
 from vaneloop.identification.unmodelled.problem import CurveProblem, grain_of, in_grains, promises
 from vaneloop.identification.unmodelled.screening import screened, smoothed
 from vaneloop.identification.unmodelled.surface_search import SurfaceSelection

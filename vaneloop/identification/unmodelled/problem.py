@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from vaneloop.base.side_by_side import Answer, Item, side_by_side
-from vaneloop.identification.least_squares.broyden import NOT_KNOWN, Known
+from vaneloop.identification.least_squares.levenberg_marquardt import NOT_KNOWN, Known
 from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.results import StageDiagnosis

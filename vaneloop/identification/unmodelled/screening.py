@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vaneloop.base.durations import within_no_period
-from vaneloop.identification.least_squares.broyden import bounded_step
+from vaneloop.identification.least_squares.levenberg_marquardt import bounded_step
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.selection.screening import Linearisation
 from vaneloop.identification.settings import (

@@ -18,8 +18,8 @@ from numba import njit
 from vaneloop.base.kept import kept_njit
 from vaneloop.identification.candidates import laws, library
 from vaneloop.identification.subsystem import Array, StageError
+from vaneloop.identification.user_models.system import FIRST_CODE, Law
 from vaneloop.identification.user_models.user_code import InATuple, cannot, place_of
-from vaneloop.identification.user_models.user_laws import FIRST_CODE, Law
 
 __all__ = ["Dispatch", "compiled_code", "dispatch_of", "try_law"]
 

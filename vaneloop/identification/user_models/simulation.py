@@ -23,6 +23,7 @@ from vaneloop.identification.user_models.codegen import Dispatch, dispatch_of
 from vaneloop.identification.user_models.data import Data
 from vaneloop.identification.user_models.kernel import Kernel, build_kernels
 from vaneloop.identification.user_models.motion import low_pass
+from vaneloop.identification.user_models.system import FIRST_CODE
 from vaneloop.identification.user_models.terms import (
     COLUMN,
     INPUT,
@@ -35,7 +36,6 @@ from vaneloop.identification.user_models.terms import (
     surfaces_for_kernel,
 )
 from vaneloop.identification.user_models.user_code import UserCode, cannot
-from vaneloop.identification.user_models.user_laws import FIRST_CODE
 
 __all__ = ["Placed", "Runner"]
 
