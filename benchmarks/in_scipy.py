@@ -19,6 +19,7 @@ from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
 from vaneloop.identification.least_squares import problem as fitting
+from vaneloop.identification.least_squares.levenberg_marquardt import NOT_KNOWN
 from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import diagnose_stage
 from vaneloop.identification.selection.search import Search
@@ -37,10 +38,10 @@ def _recorded() -> Iterator[list[Any]]:
     fit, screen = fitting.LeastSquaresProblem.fitting, Search._screen
 
     def note_fit(
-        self: LeastSquaresProblem, effects: tuple[str, ...], start: Any, iterations: int = 12, weights: Any = None
+        self: LeastSquaresProblem, effects: tuple[str, ...], start: Any, iterations: int = 12, slopes: Any = NOT_KNOWN
     ) -> Any:
         jobs.append((self, effects, np.array(start.theta if isinstance(start, Fit) else start), iterations))
-        return fit(self, effects, start, iterations, weights)
+        return fit(self, effects, start, iterations, slopes)
 
     def note_screen(self: Search) -> Any:
         jobs.append(self)

@@ -18,7 +18,7 @@ from vaneloop.identification import Effect, Parameter, Stage, StageError
 from vaneloop.identification.least_squares.levenberg_marquardt import BroydenJacobian, Known, LatestSlopes, bounded_step
 from vaneloop.identification.least_squares.levenberg_marquardt import carries as carries_along
 from vaneloop.identification.least_squares.noise import correlation_of, floor_deviation, most_floor, tolerance
-from vaneloop.identification.least_squares.problem import LeastSquaresProblem, covariance, finished, recalibrate
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem, covariance, recalibrate, to_the_end
 from vaneloop.identification.least_squares.residuals import ResidualCache
 from vaneloop.identification.results import at_bound, estimates, parameters_of, recalibrated, rms_of, rms_per_output
 from vaneloop.identification.subsystem import Array, lifted, noise_of, reach_of, size_of, without_jumps
@@ -188,9 +188,7 @@ def test_a_fit_is_the_least_squares_solution_and_each_block_is_held_out_of_the_e
         cost = np.sum((y - a @ whole)[block == b] ** 2)
         assert fit.cost[b] == pytest.approx(cost, rel=1e-6)
         assert fit.held_out[b] == pytest.approx(held, rel=1e-4)
-    weights = np.ones(judge.n_blocks)
-    weights[left_out] = 0.0
-    without = judge.fit(("a", "b"), stage.neutral(), weights=weights)
+    without = LeastSquaresProblem(stage, FLOOR, block[:N] != left_out).fit(("a", "b"), stage.neutral())
     use = np.append(block != left_out, True)
     assert without.theta == pytest.approx(
         np.linalg.lstsq(np.vstack([a, prior])[use], np.append(y, prior[0])[use], rcond=None)[0], abs=1e-5
@@ -606,8 +604,8 @@ def test_a_fit_is_gone_on_with_until_it_falls_no_more() -> None:
     judge = LeastSquaresProblem(decaying(3, 6.0, 2.5), FLOOR[:1])
     start = np.array([1.0, 0.2, 0.1])
     first = judge.fit(("law",), start, 1)
-    (once,) = judge.together([finished(judge, judge.fitting(("law",), start, 1), False)])
-    (whole,) = judge.together([finished(judge, judge.fitting(("law",), start, 1))])
+    (once,) = judge.together([to_the_end(judge, judge.fitting(("law",), start, 1), False)])
+    (whole,) = judge.together([to_the_end(judge, judge.fitting(("law",), start, 1))])
     assert once.theta.tolist() == first.theta.tolist()
     assert judge.total_of(whole) < 0.5 * judge.total_of(first)
     assert judge.total_of(whole) == pytest.approx(judge.total_of(judge.fit(("law",), start, 60)), rel=1e-3)

@@ -137,14 +137,12 @@ class Begin(NamedTuple):
     linear  costs, gradients and normals of the blocks there, where they are known; then ``slopes`` may be errors and
             slopes at the very place
     near    slopes near there, as far as they are known
-    weights of the blocks; None: 1
     """
 
     theta: Array
     linear: Linear | None = None
     slopes: tuple[Array, Array] | None = None
     near: Known = NOT_KNOWN
-    weights: Array | None = None
 
 
 class End(NamedTuple):
@@ -215,14 +213,14 @@ def carries(problem: Problem, free: Array) -> bool:
 def levenberg_marquardt(problem: Problem, free: Array, begin: Begin, iterations: int) -> Generator[Array, Array, End]:
     """The steps of a `identification.least_squares.problem.LeastSquaresProblem.fitting` in these columns."""
     low, high = problem.bounds()
-    theta, linear, weights = problem.wrapped(np.clip(begin.theta, low, high)), begin.linear, begin.weights
+    theta, linear = problem.wrapped(np.clip(begin.theta, low, high)), begin.linear
     expected, prior, scale = problem.stage.expected(), problem.prior[free], problem.scale[free]
-    block_weights = np.ones(problem.n_blocks) if weights is None else weights
+    every = np.ones(problem.n_blocks)  # sums over the blocks are products with it
 
     def total(cost: Array, thetas: Array) -> Array:
-        return cost @ block_weights + np.sum(prior * (thetas[:, free] - expected[free]) ** 2, axis=1)
+        return cost @ every + np.sum(prior * (thetas[:, free] - expected[free]) ** 2, axis=1)
 
-    may_carry = weights is None and carries(problem, free)
+    may_carry = carries(problem, free)
     carried = BroydenJacobian(*begin.slopes) if begin.slopes is not None and may_carry else None
     fresh = True  # whether the next step goes by slopes that are simulated
     damping, stalled, here, lately = 1e-3, False, np.inf, 0.0
@@ -246,7 +244,7 @@ def levenberg_marquardt(problem: Problem, free: Array, begin: Begin, iterations:
             carried = BroydenJacobian(error, slopes) if may_carry else None
         if linear is not None:
             here = float(total(linear[0][None], theta[None])[0])
-            a, g = np.tensordot(block_weights, linear[2], 1), block_weights @ linear[1]
+            a, g = np.tensordot(every, linear[2], 1), every @ linear[1]
         else:
             assert carried is not None
             a, g = carried.normal, carried.gradient

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
 
@@ -42,7 +42,7 @@ from vaneloop.identification.settings import (
 )
 from vaneloop.identification.subsystem import Array, Stage, StageError
 
-__all__ = ["Fit", "LeastSquaresProblem", "Task", "covariance", "finished", "recalibrate"]
+__all__ = ["Fit", "LeastSquaresProblem", "Task", "covariance", "recalibrate", "to_the_end"]
 
 Answer = TypeVar("Answer")
 Task = Generator[
@@ -257,17 +257,13 @@ class LeastSquaresProblem:
         """What the fit has minimised."""
         return float(fit.cost.sum() + np.sum(fit.prior * (fit.theta - self.stage.expected())[fit.free] ** 2))
 
-    def fit(
-        self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None,
-        slopes: Known = NOT_KNOWN,
-    ) -> Fit:  # fmt: skip
+    def fit(self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, slopes: Known = NOT_KNOWN) -> Fit:
         """Fit the nominal parameters and those of ``effects`` from ``start``.
 
-        start    parameters, or a fit to go on from: where its effects are the same, its derivatives are used again
-        weights  of every block, default 1; 0 leaves a block out
-        slopes   near the start, as far as they are known
+        start   parameters, or a fit to go on from: where its effects are the same, its derivatives are used again
+        slopes  near the start, as far as they are known
         """
-        return self.together([self.fitting(effects, start, iterations, weights, slopes)])[0]
+        return self.together([self.fitting(effects, start, iterations, slopes)])[0]
 
     def together(self, tasks: Sequence[Task[Answer]]) -> list[Answer]:
         """Run tasks side by side; return what each returns, in their order.
@@ -301,39 +297,35 @@ class LeastSquaresProblem:
         return answers
 
     def fitting(
-        self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, weights: Array | None = None,
-        slopes: Known = NOT_KNOWN,
-    ) -> Task[Fit]:  # fmt: skip
+        self, effects: tuple[str, ...], start: Array | Fit, iterations: int = 12, slopes: Known = NOT_KNOWN
+    ) -> Task[Fit]:
         """`fit` as a task for `together`."""
-        end = yield from self._descent(effects, start, iterations, weights, slopes)
-        s, free, scale, linear = self.stage, end.free, self.scale[end.free], end.linear
-        low, high = self.bounds()
+        end = yield from self._descent(effects, start, iterations, slopes)
+        free, linear = end.free, end.linear
         if linear is None:
-            thetas, derivative = self.differences(end.theta, free, scale, high, end.errors)
+            thetas, derivative = self.differences(end.theta, free, self.scale[free], self.bounds()[1], end.errors)
             error, rows = derivative((yield thetas))
             linear = self.blocks(error, rows)
             if carries(self, free):
                 self._near.put(end.theta, free, error, rows)
-        fit = self._finish(effects, end.theta, free, end.prior, scale, s.expected(), low, high, *linear)
-        return replace(fit, stalled=end.stalled, near=self._near)
+        return self._finish(effects, end, *linear)
 
     def leading(self, effects: tuple[str, ...], start: Array, iterations: int, slopes: Known = NOT_KNOWN) -> Task[Led]:
         """Where the first steps of a `fitting` lead.
 
         What a fit is judged by, its derivatives at its end, costs as much as a step. Here it is left out.
         """
-        end = yield from self._descent(effects, start, iterations, slopes=slopes)
+        end = yield from self._descent(effects, start, iterations, slopes)
         return Led(end.total, end.theta, end.near)
 
     def _descent(
-        self, effects: tuple[str, ...], start: Array | Fit, iterations: int, weights: Array | None = None,
-        slopes: Known = NOT_KNOWN,
-    ) -> Task[End]:  # fmt: skip
+        self, effects: tuple[str, ...], start: Array | Fit, iterations: int, slopes: Known = NOT_KNOWN
+    ) -> Task[End]:
         """The steps of a `fitting`."""
         free = self.columns(effects)
         if not isinstance(start, Fit):
-            return (yield from levenberg_marquardt(self, free, Begin(start, None, None, slopes, weights), iterations))
-        begin = Begin(start.theta, None, None, slopes, weights)
+            return (yield from levenberg_marquardt(self, free, Begin(start, near=slopes), iterations))
+        begin = Begin(start.theta, near=slopes)
         if start.effects == effects and np.array_equal(start.free, free):
             at_start = start.near.get(start.theta, free) if start.near is not None else None
             begin = begin._replace(linear=(start.cost, start.gradients, start.normals), slopes=at_start)
@@ -427,12 +419,15 @@ class LeastSquaresProblem:
             self._shared[key] = row, many
         return self._shared[key]
 
-    def _finish(
-        self, effects: tuple[str, ...], theta: Array, free: Array, prior: Array, scale: Array, expected: Array,
-        low: Array, high: Array,
-        cost: Array, gradients: Array, normals: Array,
-    ) -> Fit:  # fmt: skip
-        k = len(free)
+    def _finish(self, effects: tuple[str, ...], end: End, cost: Array, gradients: Array, normals: Array) -> Fit:
+        theta, free, prior, scale, expected = (
+            end.theta,
+            end.free,
+            end.prior,
+            self.scale[end.free],
+            self.stage.expected(),
+        )
+        (low, high), k = self.bounds(), len(free)
         # parameters at a bound do not move
         scaled_prior = prior * scale**2
         pinned = (theta[free] <= low[free]) | (theta[free] >= high[free])
@@ -446,7 +441,7 @@ class LeastSquaresProblem:
             total = nm.sum(axis=0) + np.diag(pm)
             a = total - nm + 1e-9 * np.diag(np.maximum(np.diag(total), 1e-12))
             without = np.linalg.solve(a, (pull - gm)[:, :, None])[:, :, 0]
-            held = self._held_out(cost, theta, free, scale, low, high, move, gradients, normals)
+            held = self._held_out(theta, free, move, cost, gradients, normals)
             centre = without.mean(axis=0)
             spread = np.zeros(k)
             spread[move] = (self.n_blocks - 1) / self.n_blocks * np.sum((without - centre) ** 2, axis=0)
@@ -465,6 +460,8 @@ class LeastSquaresProblem:
             prior,
             theta[free] - half,
             theta[free] + half,
+            end.stalled,
+            self._near,
         )
 
     def _covariance(self, cost: Array, normals: Array, scaled_prior: Array, move: Array) -> Array:
@@ -492,18 +489,7 @@ class LeastSquaresProblem:
             sizes = np.sqrt(np.where(move, np.diag(known), np.nan))
             return np.asarray(np.clip(known / np.outer(sizes, sizes), -1.0, 1.0))
 
-    def _held_out(
-        self,
-        cost: Array,
-        theta: Array,
-        free: Array,
-        scale: Array,
-        low: Array,
-        high: Array,
-        move: Array,
-        gradients: Array,
-        normals: Array,
-    ) -> Array:
+    def _held_out(self, theta: Array, free: Array, move: Array, cost: Array, gradients: Array, normals: Array) -> Array:
         """Cost of each block with the effects' parameters fitted to the other blocks.
 
         Nominal parameters are calibrated on the whole log: a lag that only one manoeuvre shows is no reason to distrust
@@ -515,7 +501,7 @@ class LeastSquaresProblem:
         g, a = gradients[:, mine], normals[:, mine][:, :, mine]
         total, pull = a.sum(axis=0), g.sum(axis=0)
         ridge = 1e-6 * np.diag(np.maximum(np.diag(total), 1e-12))
-        columns, size = free[mine], scale[mine]
+        columns, size, (low, high) = free[mine], self.scale[free[mine]], self.bounds()
         step = np.linalg.solve(total - a + ridge, (pull - g)[:, :, None])[:, :, 0]
         step = np.clip(step, (low[columns] - theta[columns]) / size, (high[columns] - theta[columns]) / size)
         return np.asarray(cost - 2.0 * np.sum(step * g, axis=1) + np.einsum("bi,bij,bj->b", step, a, step))
@@ -536,7 +522,7 @@ def _apart(one: Moves, other: Moves) -> bool:
     return any(None not in (a, b) and a != b for a, b in zip(one, other, strict=True))
 
 
-def finished(judge: LeastSquaresProblem, task: Task[Fit], go_on: bool = True) -> Task[Fit]:
+def to_the_end(judge: LeastSquaresProblem, task: Task[Fit], go_on: bool = True) -> Task[Fit]:
     """The fit, gone on with until its error falls no more."""
     fit = yield from task
     for _ in range(4 if go_on else 0):
@@ -564,5 +550,5 @@ def recalibrate(judge: LeastSquaresProblem) -> Fit:
             f"{int(silent.sum()):,} samples; allowed: finite values"
         )
     begins = [judge.stage.neutral(), *(judge.stage.begins if judge.stage.begins is not None else ())]
-    fits = judge.together([finished(judge, judge.fitting((), b), len(begins) > 1) for b in begins])
+    fits = judge.together([to_the_end(judge, judge.fitting((), b), len(begins) > 1) for b in begins])
     return min(fits, key=judge.total_of)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from vaneloop.identification.least_squares.levenberg_marquardt import NOT_KNOWN, bounded_step
-from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, Led, Task, finished, recalibrate
+from vaneloop.identification.least_squares.problem import Fit, LeastSquaresProblem, Led, Task, recalibrate, to_the_end
 from vaneloop.identification.selection.screening import Linearisation, along, followed, onward, out_of, within
 from vaneloop.identification.selection.stepwise import eliminate
 from vaneloop.identification.settings import DIRECTIONS, STARTS_TOGETHER
@@ -111,10 +111,6 @@ class Search:
         criterion.begin(self.base)
         self.quiet = not criterion.fails(self.base)
         self.starts = self._screen()
-
-    def _finished(self, task: Task[Fit], go_on: bool = True) -> Task[Fit]:
-        """The fit, gone on with until its error falls no more."""
-        return (yield from finished(self.judge, task, go_on))
 
     # ---- one effect --------------------------------------------------------------------------------------------------
 
@@ -291,7 +287,7 @@ class Search:
             best = yield from self._begun(name)
             if float(self.base.cost.sum() - best.cost.sum()) > self.criterion.least:  # worth finishing
                 task = self.judge.fitting((name,), best, self._steps((name,)))
-                best = yield from self._finished(task, self.criterion.roams)
+                best = yield from to_the_end(self.judge, task, self.criterion.roams)
                 best = yield from self._refine(name, best)
             self.fits[key] = best
             self.tick()
@@ -347,7 +343,7 @@ class Search:
                 continue
             effects = tuple(held if e == name else e for e in fit.effects)
             theta = out_of(self.stage, fit.theta, name, held)
-            again = self.judge.together([self._finished(self.judge.fitting(effects, theta, 8))])[0]
+            again = self.judge.together([to_the_end(self.judge, self.judge.fitting(effects, theta, 8))])[0]
             known = self.fits.get(frozenset(effects), again)
             out.append(min(known, again, key=self.judge.total_of))
             self.fits[frozenset(effects)] = out[-1]
@@ -456,7 +452,7 @@ class Search:
             self.tick()
         if finished and key not in self.finished:
             task = self.judge.fitting(tuple(effects), self.fits[key], 8)
-            self.fits[key] = yield from self._finished(task, self.criterion.roams)
+            self.fits[key] = yield from to_the_end(self.judge, task, self.criterion.roams)
             self.finished.add(key)
             self.tick()
         self.fits[key] = yield from self._no_worse(self.fits[key])
@@ -478,7 +474,7 @@ class Search:
             theta = theta.copy()
             theta[at] = first + share * (neutral - first)
             theta = self.judge.lead(rest, theta, 5).theta
-        other = self.judge.together([self._finished(self.judge.fitting(rest, theta, 8))])[0]
+        other = self.judge.together([to_the_end(self.judge, self.judge.fitting(rest, theta, 8))])[0]
         if self.judge.total_of(other) < 0.99 * self.judge.total_of(known):
             self.fits[frozenset(rest)] = known = other
             if not rest:

@@ -455,5 +455,3 @@ class CurveSearch(CurveProblem):
             return None
         begun = replace(smooth.fit, theta=np.append(smooth.fit.theta, 0.0))
         return self._finished(current, replace(smooth, candidate=c, fit=begun))
-
-    # ---- other logs --------------------------------------------------------------------------------------------------
