@@ -151,8 +151,7 @@ def killed(place: Path, kills: int, logs: int, seed: int) -> dict[str, Any]:
     import tests.fleet_jobs  # noqa: F401 (the stand-in is a kind of work)
     from vaneloop.fleet import sources, state, tables
     from vaneloop.fleet.folder import Folder
-    from vaneloop.fleet.journal import lines
-    from vaneloop.fleet.worker import work
+    from vaneloop.fleet.worker import lines, work
 
     draw = random.Random(seed)
     for k in range(logs):

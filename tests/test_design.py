@@ -11,6 +11,7 @@ import pytest
 
 from tests.browser import open_to_all
 from tests.conftest import quick_first
+from tests.trend_filters import filterpy_estimates, filterpy_gain, firmware_estimates, tracking_index_gain
 from vaneloop.base.errors import InputError
 from vaneloop.design import trend as tf
 from vaneloop.design.limit_cycles import LimitCycle, Play, limit_cycles, play_describing_function
@@ -347,8 +348,8 @@ def bus_noise(n: int, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("acceleration", [0.05, 0.3, 3.0, 30.0])
 def test_kalman_gain_of_filterpy_is_riccatis_and_the_closed_form(acceleration: float) -> None:
     model = tf.TrendModel(acceleration=acceleration)
-    assert tf.filterpy_gain(model) == pytest.approx(tf.riccati_gain(model), rel=1e-10)
-    assert tf.tracking_index_gain(model) == pytest.approx(tf.riccati_gain(model), rel=1e-10)
+    assert filterpy_gain(model) == pytest.approx(tf.riccati_gain(model), rel=1e-10)
+    assert tracking_index_gain(model) == pytest.approx(tf.riccati_gain(model), rel=1e-10)
 
 
 def test_the_firmwares_filter_estimates_what_filterpy_estimates() -> None:
@@ -360,8 +361,8 @@ def test_the_firmwares_filter_estimates_what_filterpy_estimates() -> None:
         - np.clip(0.1 * (t - 30), 0, 2)
         + bus_noise(t.size)
     )
-    n, rate = tf.filterpy_estimates(tf.TrendModel(), y)
-    n_fw, rate_fw, _ = tf.firmware_estimates(y, TREND)
+    n, rate = filterpy_estimates(tf.TrendModel(), y)
+    n_fw, rate_fw, _ = firmware_estimates(y, TREND)
     np.testing.assert_allclose(n_fw, n, rtol=0, atol=1e-11)
     np.testing.assert_allclose(rate_fw, rate, rtol=0, atol=1e-10)
 
@@ -383,7 +384,7 @@ def test_the_calibration_holds_the_recommended_values() -> None:
 def test_rate_noise_and_false_turns_are_what_a_long_run_shows() -> None:
     model = tf.TrendModel()
     y = 80 + bus_noise(360_000)
-    rate = tf.firmware_estimates(y, TREND)[1][2000:]
+    rate = firmware_estimates(y, TREND)[1][2000:]
     assert np.std(rate) == pytest.approx(TREND.rate_noise, rel=0.03)
     # at thresholds that are crossed often enough to be counted
     for u in (2.0, 2.5):
@@ -402,11 +403,11 @@ def test_the_firmwares_direction_is_the_written_rule(seed: int) -> None:
     y = 70 + np.cumsum(steps) * 0.01 + bus_noise(steps.size, seed)
     expected = tf.direction(y, TREND)
     assert np.any(np.diff(expected) != 0)
-    assert np.array_equal(tf.firmware_estimates(y, TREND)[2], expected)
+    assert np.array_equal(firmware_estimates(y, TREND)[2], expected)
 
 
 def turns(y: np.ndarray) -> int:
-    return int(np.sum(np.diff(tf.firmware_estimates(y, TREND)[2]) != 0))
+    return int(np.sum(np.diff(firmware_estimates(y, TREND)[2]) != 0))
 
 
 @pytest.mark.parametrize("hertz", [0.02, 0.1, 0.3, 0.5, 1.0, 2.0, 10.0])
@@ -427,4 +428,4 @@ def test_a_fall_turns_it_once_and_in_time(rate: float, latest: float) -> None:
     for seed in range(5):
         y = 80 - np.clip(rate * (t - 5), 0, 30) + bus_noise(t.size, seed)
         assert turns(y) == 1
-        assert t[np.argmax(tf.firmware_estimates(y, TREND)[2] < 0)] - 5.0 <= latest
+        assert t[np.argmax(firmware_estimates(y, TREND)[2] < 0)] - 5.0 <= latest

@@ -17,6 +17,7 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from tests.test_design import servo_with_play
+from tests.trend_filters import filterpy_estimates, filterpy_gain, firmware_estimates, tracking_index_gain
 from vaneloop.base.errors import InputError
 from vaneloop.base.tables import path
 from vaneloop.design import servo, servo_design
@@ -935,16 +936,16 @@ def test_the_trends_model_is_its_equations() -> None:
     np.testing.assert_allclose(r, [[m.sigma**2]])
     # alpha and beta by Kalata's tracking index, and what the filter settles to
     index = 2.0 * 0.1**2 / m.sigma
-    alpha, beta = tf.tracking_index_gain(m)
+    alpha, beta = tracking_index_gain(m)
     assert index**2 == pytest.approx(beta**2 / (1 - alpha))
     assert beta == pytest.approx(2 * (2 - alpha) - 4 * math.sqrt(1 - alpha))
     assert tf.riccati_gain(m) == pytest.approx((alpha, beta), rel=1e-9)
-    assert tf.filterpy_gain(m) == pytest.approx((alpha, beta), rel=1e-9)
+    assert filterpy_gain(m) == pytest.approx((alpha, beta), rel=1e-9)
 
 
 def test_a_filter_that_has_not_settled_is_stopped_by_its_steps() -> None:
     m = tf.TrendModel()
-    assert tf.filterpy_gain(m, steps=3) != pytest.approx(tf.riccati_gain(m), rel=1e-3)
+    assert filterpy_gain(m, steps=3) != pytest.approx(tf.riccati_gain(m), rel=1e-3)
 
 
 def test_the_noise_of_the_rate_is_the_impulse_responses_energy() -> None:
@@ -987,14 +988,14 @@ def test_the_estimates_start_at_rest_on_the_first_sample() -> None:
     m = tf.TrendModel()
     d = tf.recommend(m)
     leap = np.array([50.0, 51.0, 49.0, 49.5, 50.0])  # each of the first samples another
-    for got, expected in zip(tf.firmware_estimates(leap, d)[:2], tf.filterpy_estimates(m, leap), strict=True):
+    for got, expected in zip(firmware_estimates(leap, d)[:2], filterpy_estimates(m, leap), strict=True):
         np.testing.assert_allclose(got, expected, atol=1e-10)
-    assert tf.firmware_estimates(leap, d)[0][0] == 50.0
+    assert firmware_estimates(leap, d)[0][0] == 50.0
     y = np.array([50.0, 50.0, 51.0, 51.0])
-    n, rate = tf.filterpy_estimates(m, y)
+    n, rate = filterpy_estimates(m, y)
     assert (n[0], rate[0]) == (50.0, 0.0)
     assert (n[2], rate[2]) == pytest.approx((50.0 + d.alpha, d.beta / 0.01))
-    got = tf.firmware_estimates(y, d)
+    got = firmware_estimates(y, d)
     np.testing.assert_allclose(got[0], n, atol=1e-12)
     np.testing.assert_allclose(got[1], rate, atol=1e-10)
     assert got[2].tolist() == [1.0] * 4
@@ -1034,4 +1035,4 @@ def test_one_sample_alone_neither_sets_the_turn_nor_turns() -> None:
     y = np.r_[np.full(20, 60.0), np.full(20, 59.0), np.full(20, 59.6)]
     d = tf.direction(y, SLOW)
     assert (np.flatnonzero(np.diff(d)) + 1).tolist() == [29, 49]
-    np.testing.assert_array_equal(tf.firmware_estimates(y, SLOW)[2], d)
+    np.testing.assert_array_equal(firmware_estimates(y, SLOW)[2], d)

@@ -39,8 +39,8 @@ from plant.effects_page import page
 from plant.geometry import vane_angles
 from plant.layout import GEOMETRY, N_NOMINAL
 from plant.linkage import G_LB, G_LC, N_CRANK, N_PER_STAGE
+from plant.linkage_lanes import arctangent, tangent
 from plant.parameters import DRIVE_EFFECTS, DRIVE_LOADED, VANE_EFFECTS, derive
-from plant.series import arctangent, tangent
 from plant.stages import actuator_run, engine_run, linkage_run, step_currents
 from plant.stages.blocks import W
 from plant.stages.linkage import SOME

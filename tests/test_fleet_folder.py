@@ -28,9 +28,9 @@ import pyarrow.parquet as pq
 from vaneloop.base.errors import InputError
 from vaneloop.fleet import files, folder, leases, sources, state, tables
 from vaneloop.fleet.folder import LEFT_BEHIND, Entry, Folder, copies_of, key_of
-from vaneloop.fleet.journal import Journal, lines
 from vaneloop.fleet.leases import BEATS, Leases, Me, gone
 from vaneloop.fleet.sources import Source, find, moment
+from vaneloop.fleet.worker import Journal, lines
 
 
 def sha(text: str) -> str:
@@ -144,9 +144,9 @@ def test_a_digest_is_that_of_the_content(tmp_path: Path) -> None:
 def test_a_journal_has_a_line_for_each_note_and_keeps_what_was_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vaneloop.fleet.journal.time.time", lambda: 12.34567)
+    monkeypatch.setattr("vaneloop.fleet.worker.time.time", lambda: 12.34567)
     synced: list[int] = []
-    monkeypatch.setattr("vaneloop.fleet.journal.os.fsync", synced.append)
+    monkeypatch.setattr("vaneloop.fleet.worker.os.fsync", synced.append)
     for name, what in (("w2", "took"), ("w1", "begin"), ("w1", "end")):
         journal = Journal(tmp_path / "run" / "of", name)
         journal.note(what, key="k")

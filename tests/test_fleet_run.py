@@ -28,9 +28,8 @@ from tests.conftest import ROOT
 from vaneloop.base.errors import InputError
 from vaneloop.fleet import sources, state
 from vaneloop.fleet.folder import Folder
-from vaneloop.fleet.journal import Journal, lines
 from vaneloop.fleet.leases import Leases, Me
-from vaneloop.fleet.worker import DEATHS, work
+from vaneloop.fleet.worker import DEATHS, Journal, lines, work
 
 JOB = "read"
 ENV = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"}

@@ -27,12 +27,11 @@ from vaneloop.base.errors import DeviceError, InputError
 from vaneloop.fleet import diagnosis, reader, rent, worker
 from vaneloop.fleet.files import read_json, whole_json
 from vaneloop.fleet.folder import Folder, key_of
-from vaneloop.fleet.journal import lines
 from vaneloop.fleet.kinds import KINDS, Kind, Options
 from vaneloop.fleet.leases import Leases
 from vaneloop.fleet.reader import Died, NotReady, Reader, Stopped, TimedOut
 from vaneloop.fleet.sources import Source
-from vaneloop.fleet.worker import work
+from vaneloop.fleet.worker import lines, work
 
 ONE = Kind((__name__, "stand_in"), Options)
 DONE = {"status": "done", "reason": "", "verdict": "none", "answer": {}}

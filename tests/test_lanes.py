@@ -19,8 +19,8 @@ from hil.loop.lanes import lockstep_lanes
 from hil.loop.lockstep import Run, Stimulus, lockstep
 from plant import Model, Plant, build_plant, chain_lanes, linkage, linkage_lanes
 from plant.effects import EFFECTS
+from plant.linkage_lanes import arcsine
 from plant.parameters import nominal
-from plant.series import arcsine
 from plant.stages.blocks import on_all_cores
 from tests.machines import machine
 from vaneloop.base.vanes import VANES

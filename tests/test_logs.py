@@ -21,7 +21,6 @@ from hypothesis import strategies as st
 
 from hil.bus.frames import AUTH
 from hil.logs import Channel, Log, LogError, csv_format, read_log, write_log
-from hil.logs.asc import read_asc
 from hil.logs.blf import read_blf
 from hil.logs.candump import read_candump
 from hil.logs.dbc import Message, load_dbc
@@ -29,7 +28,7 @@ from hil.logs.formats import FORMATS
 from hil.logs.frames import EXTENDED, Frames
 from hil.logs.notes import Note
 from hil.logs.signals import cut_signal, e2e_crc, encode, select
-from hil.logs.trc import read_trc
+from hil.logs.tool_traces import read_asc, read_trc
 from tests.conftest import examples
 from vaneloop.base import tables
 from vaneloop.base.signals import SIDES, UNITS

@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 from hil.logs import Channel, LogError, plausible, read_log, write_log
-from hil.logs.asc import read_asc
 from hil.logs.blf import read_blf
 from hil.logs.bus_log import Bus, encode_channels
 from hil.logs.candump import read_candump, write_candump
@@ -29,7 +28,7 @@ from hil.logs.signals import crc_table, cut_raw, cut_signal, e2e_crc, encode, pg
 from hil.logs.source import Options
 from hil.logs.text_lines import match_lines
 from hil.logs.through_can import write_asc, write_blf, write_trc
-from hil.logs.trc import read_trc
+from hil.logs.tool_traces import read_asc, read_trc
 from vaneloop.base import tables
 
 DBC = tables.path("vgv.dbc")

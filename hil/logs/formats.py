@@ -164,7 +164,7 @@ OURS = (
     Format(
         "Vector ASCII", (".asc",), "Vector ASCII, classic and FD, `base hex`, times absolute or relative",
         names=_SIGNALS, begins=(b"date ",), framed=True,
-        frames="hil.logs.asc:read_asc", frames_out="hil.logs.through_can:write_asc",
+        frames="hil.logs.tool_traces:read_asc", frames_out="hil.logs.through_can:write_asc",
         recording="hil.logs.recordings:read_text",
     ),
     Format(
@@ -176,7 +176,7 @@ OURS = (
     Format(
         "PEAK trace", (".trc",), "PEAK trace, versions 1.0 to 1.3, 2.0, 2.1",
         names=_SIGNALS, begins=(b";$FILEVERSION",), framed=True,
-        frames="hil.logs.trc:read_trc", frames_out="hil.logs.through_can:write_trc",
+        frames="hil.logs.tool_traces:read_trc", frames_out="hil.logs.through_can:write_trc",
         recording="hil.logs.recordings:read_text",
     ),
     Format(

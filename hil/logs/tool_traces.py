@@ -1,5 +1,8 @@
-"""Text traces of further CAN tools: BUSMASTER, Microchip's CAN BUS Analyzer, CRTD, CANHacker, CARBUS Analyzer, and
-frames in CSV (SavvyCAN and GVRET, CANedge, python-can).
+"""Text traces of CAN tools: Vector ASCII (`.asc`), PEAK (`.trc`), BUSMASTER, Microchip's CAN BUS Analyzer, CRTD,
+CANHacker, CARBUS Analyzer, and frames in CSV (SavvyCAN and GVRET, CANedge, python-can).
+
+python-can's readers end at the first line that they cannot read; a log cut off in mid-line, or with a foreign event, is
+common.
 """
 
 from __future__ import annotations
@@ -15,9 +18,12 @@ import numpy as np
 
 from hil.logs.frames import EXTENDED, Frames
 from hil.logs.source import LogError, read_bytes
-from hil.logs.text_lines import Lines, Part, join_parts, match_lines
+from hil.logs.text_lines import Lines, Part, join_parts, match_lines, part_of
 
-__all__ = ["read_busmaster", "read_canhacker", "read_carbus", "read_crtd", "read_csv_frames", "read_microchip"]
+__all__ = [
+    "read_asc", "read_busmaster", "read_canhacker", "read_carbus", "read_crtd", "read_csv_frames", "read_microchip",
+    "read_trc",
+]  # fmt: skip
 
 _MINUTE, _DAY = 60 * 10**9, 86_400 * 10**9  # ns after which a clock of seconds, or of a day, begins anew
 _LATE = 10**9  # ns that a frame may come late, as loggers of several channels swap some
@@ -246,3 +252,85 @@ def _joined(path: Path, parts: Iterable[Part], of: _Trace, notes: list[str]) -> 
         ends = np.cumsum([p[0].size for p in parts])[:-1]
         parts = [(p[0], t, *p[2:]) for p, t in zip(parts, np.split(ns, ends), strict=True)]
     return join_parts(path, parts, of.name, of.example, notes)
+
+
+# ---- Vector ASCII
+
+_ASC = re.compile(
+    rb"(?P<s> *\d{1,10})\.(?P<f>\d{1,9})[ \t]+(?P<fd>CANFD[ \t]+)?(?P<bus>\d{1,4})[ \t]+(?(fd)\w+[ "
+    rb"\t]+)(?P<id>[0-9A-Fa-f]{1,8})"
+    rb"(?P<x>x?)[ \t]+(?(fd)(?:\S*[^\s01]\S*[ \t]+)?[01][ \t]+[01][ \t]+[0-9A-Fa-f]{1,2}|\w+[ \t]+d)[ "
+    rb"\t]+(?P<len>[0-9A-Fa-f]{1,2})"
+    rb"(?P<d>(?:[ \t]+[0-9A-Fa-f]{2}(?![^ \t])){0,64})(?P<tail>(?:[ \t].*)?)\Z"
+)
+_ASC_TIME = re.compile(rb"^[ \t]*(\d+\.\d+)[ \t]", re.M)
+_ASC_BASE = re.compile(rb"^[ \t]*base[ \t]+(hex|dec)(?:[ \t]+timestamps[ \t]+(absolute|relative))?", re.M | re.I)
+
+
+def read_asc(path: Path) -> Frames:
+    """Frames of a Vector ASCII log, classic and CAN FD; times absolute or relative to the event before."""
+    raw = read_bytes(path)
+    head = _ASC_BASE.search(raw[:100_000])
+    if head and head[1].lower() == b"dec":
+        raise LogError(f"{path}: has its numbers in base dec; allowed: base hex")
+    parts: list[Part] = []
+    for lines in match_lines(raw, _ASC, b" \t0123456789"):
+        if not isinstance(lines, int):
+            m = lines.match
+            most = min(int(m["len"]), 64) if m["fd"] and m["len"].isdigit() else min(int(m["len"], 16), 8)
+            parts.append(part_of(lines, 10**9, bool(m["x"]), int(m["bus"]), most))
+    if head and (head[2] or b"").lower() == b"relative":
+        events = [(m.start(), float(m[1])) for m in _ASC_TIME.finditer(raw)]
+        place, since = np.array([e[0] for e in events]), np.cumsum([e[1] for e in events])
+        parts = [(p[0], np.rint(since[np.searchsorted(place, p[0])] * 1e9).astype(np.int64), *p[2:]) for p in parts]
+    return join_parts(path, parts, "ASC", "0.010000 1  A0  Rx  d 8 00 01 02 03 04 05 06 07", [])
+
+
+# ---- PEAK
+
+_TRC_COLUMNS = {
+    b"1.0": "OILD",
+    b"1.1": "OdILD",
+    b"1.2": "OBdILD",
+    b"1.3": "OBdIRLD",
+    b"2.0": "OTIdlD",
+    b"2.1": "OTBIdRLD",
+}
+_TRC_WORD = {
+    "O": rb"(?P<s> *\d{1,15})(?:[.,](?P<f>\d{1,6}))?", "T": rb"(?:DT|FD|FB|FE|BI)", "B": rb"(?P<bus>\d{1,3})",
+    "I": rb"(?P<id>[0-9A-Fa-f]{3,8})", "d": rb"(?:Rx|Tx)", "R": rb"\S+", "L": rb"(?P<len>\d{1,2})(?![ "
+                                                                              rb"\t]+RTR)", "l": rb"(?P<len>\d{1,2})",
+}  # fmt: skip
+
+
+def read_trc(path: Path) -> Frames:
+    """Frames of a PEAK trace, versions 1.0 to 2.1; times in ms."""
+    raw = read_bytes(path)
+    version = re.search(rb"^;\$FILEVERSION=(\d\.\d)", raw[:100_000], re.M)
+    if version and version[1] not in _TRC_COLUMNS:
+        raise LogError(
+            f"{path}: TRC version {version[1].decode()} is not known; allowed: {b', '.join(_TRC_COLUMNS).decode()}"
+        )
+    stated = re.search(rb"^;\$COLUMNS=N,([A-Za-z,]+)", raw[:100_000], re.M)
+    columns = stated[1].decode().replace(",", "") if stated else _TRC_COLUMNS[version[1] if version else b"1.0"]
+    given = set(columns)
+    if (
+        not given <= {*_TRC_WORD, "D"}
+        or len(given) < len(columns)
+        or not {"O", "I", "D"} <= given
+        or columns[-1] != "D"
+    ):
+        raise LogError(f"{path}: TRC columns {columns} are not understood; allowed: {', '.join(_TRC_WORD)}, and D last")
+    if ("L" in given) == ("l" in given):
+        raise LogError(f"{path}: TRC columns {columns} must have one of L and l")
+    words = b"".join((rb"[ \t]" if c == "O" else rb"[ \t]+") + _TRC_WORD[c] for c in columns[:-1])
+    bytes_ = rb"(?P<d>(?:[ \t]+[0-9A-Fa-f]{2}(?![^ \t])){0,64})(?P<tail>(?:[ \t].*)?)\Z"
+    layout = re.compile(rb"(?P<n> *\d{1,10})\)?" + words + bytes_)
+    parts = []
+    for lines in match_lines(raw, layout, b" \t0123456789"):
+        if not isinstance(lines, int):
+            m, n = lines.match, int(lines.match["len"])
+            most = n if "l" in columns or n <= 8 else (12, 16, 20, 24, 32, 48, 64)[min(n, 15) - 9]
+            bus = int(m["bus"]) if "B" in columns else 1
+            parts.append(part_of(lines, 10**6, len(m["id"]) > 4, bus, min(most, 64)))
+    return join_parts(path, parts, "TRC", "1)  10.0  Rx  00A0  8  00 01 02 03 04 05 06 07", [])

@@ -17,9 +17,9 @@ from typing import Any, Protocol, TypeVar, cast
 import numba
 from numba import njit
 
+from vaneloop.base.files import own_folder
 from vaneloop.base.kept import is_kept, keep, sources_digest
 from vaneloop.base.lean import called_by_code
-from vaneloop.base.temporary import own_folder
 
 __all__ = [
     "cache_folder", "compiled", "compiled_free", "fused", "in_place", "in_place_free", "inlined", "is_cached",

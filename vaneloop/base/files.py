@@ -7,17 +7,20 @@ Only the standard library is imported here.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import os
+import shutil
 import stat
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 from vaneloop.base.errors import InputError
 
-__all__ = ["cannot_write", "check", "replacing", "whole", "write", "write_all"]
+__all__ = ["cannot_write", "check", "own_folder", "replacing", "whole", "write", "write_all"]
 
 
 def cannot_write(path: object, error: OSError) -> str:
@@ -166,3 +169,12 @@ def _sync(name: str) -> None:
         os.fsync(fd)
     finally:
         os.close(fd)
+
+
+def own_folder(prefix: str) -> Path:
+    """Make a folder for temporary files that only this user may enter, and that goes with its process; nobody can have
+    made it before, as its name is drawn.
+    """
+    place = tempfile.mkdtemp(prefix=prefix)
+    atexit.register(shutil.rmtree, place, ignore_errors=True)
+    return Path(place)

@@ -22,8 +22,7 @@ import pyarrow.compute as pc
 
 from vaneloop.base.cells import FORMULA
 from vaneloop.base.errors import InputError
-from vaneloop.base.files import whole
-from vaneloop.base.temporary import own_folder
+from vaneloop.base.files import own_folder, whole
 from vaneloop.fleet.folder import KEY, STATUSES, Folder
 
 if TYPE_CHECKING:
