@@ -38,7 +38,6 @@ from vaneloop.base import (
     kept,
     lean,
     spans,
-    temporary,
     terminal,
     vanes,
 )
@@ -715,9 +714,9 @@ def test_compiled_code_is_kept_where_that_can_be_written(tmp_path: Path, monkeyp
     cache.rmdir()
     cache.write_text("no folder")
     gone: list[Any] = []
-    monkeypatch.setattr(temporary.atexit, "register", lambda *a, **how: gone.append((*a, how)))
+    monkeypatch.setattr(files.atexit, "register", lambda *a, **how: gone.append((*a, how)))
     own = folder()  # of this process alone, and gone with it
-    assert own.name == name and gone == [(temporary.shutil.rmtree, str(own.parent), {"ignore_errors": True})]
+    assert own.name == name and gone == [(files.shutil.rmtree, str(own.parent), {"ignore_errors": True})]
     assert own.parent.name.startswith("vaneloop-") and own.parent.stat().st_mode & 0o777 == 0o700
     own.parent.rmdir()
 
