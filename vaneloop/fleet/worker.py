@@ -9,7 +9,6 @@ import random
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +47,7 @@ def lines(run: Path) -> Iterator[dict[str, Any]]:
     for file in sorted((run / "journal").glob("*.jsonl")):
         with open(file, encoding="utf-8", errors="replace") as f:
             for text in f:
-                with suppress(ValueError):
+                with contextlib.suppress(ValueError):
                     yield {**json.loads(text), "worker": file.stem}
 
 

@@ -17,8 +17,8 @@ has read.
 
 | subsystem | what reads high | what says so |
 |---|---|---|
-| servo | stroke | the current's integral runs at another rate than the error of the stroke |
-| demand | rotor speed | the stroke demand lies on the tables at another speed |
+| servo | stroke | the integral of the law drifts away from that of the logged current |
+| demand | rotor speed | the stroke demand lies elsewhere on the tables |
 | engine | rotor speed, where no demand is judged | it settles at another speed than the demanded one |
 """
 
@@ -75,7 +75,7 @@ class Late(NamedTuple):
         """What is said of it."""
         if self.zero:
             by = f"{abs(self.zero):.3g} {UNITS[self.channels[0]]} {'higher' if self.zero > 0.0 else 'lower'}"
-            return f"{self.channels[0]}: reads {by} in the file than in the controller; moved"
+            return f"{self.channels[0]}: reads {by} in the file than in the controller; subtracted"
         if self.passed.kind and not self.seconds:
             return f"{', '.join(self.channels)}: have passed {self.passed.text()}; the model's have, too"
         way = "late" if self.seconds >= 0.0 else "early"
@@ -94,17 +94,18 @@ class Late(NamedTuple):
 
 
 def aligned(log: Log, late: Sequence[Late], grid: Grid) -> Log:
-    """The log with its strokes where they belong, and the vane angles `on_rows` of its raster."""
+    """The log without zero offsets, its strokes where they belong, and the vane angles `on_rows` of its raster."""
     late = [one for one in late if one.seconds or one.drift or one.zero]
     channels = dict(log.channels)
     for one in late:
-        for name in (c for c in one.channels if c in log.channels and (one.zero or c not in DRIVING)):
+        for name in (c for c in one.channels if c in log.channels):
             c = channels[name]
             if one.zero:
                 channels[name] = replace(c, values=c.values - one.zero)
-                continue
-            moved = grid.start + one.times(c.t - grid.start)
-            channels[name] = replace(c, t=c.t - on_rows(log, one, grid) if name in VANES else moved)
+            elif name in VANES:
+                channels[name] = replace(c, t=c.t - on_rows(log, one, grid))
+            elif name not in DRIVING:
+                channels[name] = replace(c, t=grid.start + one.times(c.t - grid.start))
     return replace(log, channels=channels) if late else log
 
 
@@ -122,7 +123,7 @@ def driving(t: Array, columns: dict[str, Array], late: Sequence[Late]) -> dict[s
     """The columns of a raster with the speeds where they belong: between their rows by straight lines, for a stage is
     driven by them.
     """
-    moved = {n: one for one in late if not one.zero for n in one.channels if n in columns and n in DRIVING}
+    moved = {name: one for one in late if one.besides for name in one.channels if name in columns and name in DRIVING}
     return columns | {name: _shifted(t, columns[name], one.besides) for name, one in moved.items()}
 
 
@@ -184,15 +185,14 @@ def zeros_in_controller(stages: Sequence[Stage]) -> LateIn:
 
 def _zero(stage: Stage, channel: str) -> float:
     """By how much a channel reads high, border unit; 0: that does not explain the stage's error, or the effect that
-    looks most like it, tables whose strokes are off alike, does so better.
+    looks most like it, an offset of the tables' strokes, does so better.
     """
-    t, driven = stage.t, stage.made.driven  # type: ignore[attr-defined]
-    c, rate = driven.columns, np.zeros(0)
-    if stage.name == "servo":
-        rate = law_of(np.zeros(len(t)), np.ones(len(t)), driven.calibration)
+    driven, one = stage.made.driven, np.ones(len(stage.t))  # type: ignore[attr-defined]
+    # columns of the stage, and how they rise with the offset
+    rises = {"law": law_of(0.0 * one, one, driven.calibration)} if stage.name == "servo" else {channel: one}
 
     def of(zero: Array) -> dict[str, Array]:
-        return {"law": c["law"] - zero[0] * rate} if stage.name == "servo" else {channel: c[channel] - zero[0]}
+        return {name: driven.columns[name] - zero[0] * by for name, by in rises.items()}
 
     zero, before, after = _fit(stage, _moving(stage, of), 1, most=np.inf)
     if not explains(stage, before, after):
