@@ -17,6 +17,7 @@ from benchmarks.loggers import Logger, recorded
 from hil.figures import noise_floor
 from hil.logs import Channel, Log, read_log, write_log
 from hil.logs.stale import stale_rows
+from plant import Model, build_plant
 from tests import rig
 from tests.firmware_on_rig import firmware
 from tests.test_loggers import rows
@@ -125,6 +126,14 @@ def test_what_the_controller_has_seen_too_is_no_zero_of_the_recorder(hidden: tup
     log = rig.simulate(rig.manoeuvre(SEED, DURATION), firmware(), [rig.Hidden(*hidden)], seed=SEED).log
     chain = build_chain(Log("machine", {k: Channel(log["t"], v) for k, v in log.items() if k != "t"}, []))
     assert not any(one.zero for late in chain.late.values() for one in late)
+
+
+def test_an_offset_of_the_model_s_tables_is_no_zero_of_the_recorder():
+    log, effects = rows(SEED), {"schedule_error": {"offset": 0.3}}
+    file = Log("machine", {k: Channel(log["t"], v) for k, v in log.items() if k != "t"}, [])
+    chain = build_chain(file, build_plant(model=Model(effects=effects)), present=tuple(effects))
+    assert not any(one.zero for late in chain.late.values() for one in late)
+    assert not all(s.agrees for s in compare_stages([chain.stage("demand")]))
 
 
 def test_one_clock_stays_as_it_is():

@@ -184,25 +184,25 @@ def zeros_in_controller(stages: Sequence[Stage]) -> LateIn:
 
 
 def _zero(stage: Stage, channel: str) -> float:
-    """By how much a channel reads high, border unit; 0: that does not explain the stage's error, or the effect that
-    looks most like it, an offset of the tables' strokes, does so better.
+    """By how much a channel reads high, border unit; 0: that does not explain the stage's error, or an offset of the
+    stroke demand, as tables make whose strokes are off alike, does so better.
     """
     driven, one = stage.made.driven, np.ones(len(stage.t))  # type: ignore[attr-defined]
-    # columns of the stage, and how they rise with the offset
-    rises = {"law": law_of(0.0 * one, one, driven.calibration)} if stage.name == "servo" else {channel: one}
 
-    def of(zero: Array) -> dict[str, Array]:
-        return {name: driven.columns[name] - zero[0] * by for name, by in rises.items()}
+    def fitted(column: str, rise: Array) -> tuple[Array, Array, Array]:
+        """`_fit` of an offset, each unit of which adds ``rise`` to a column of the stage."""
 
-    zero, before, after = _fit(stage, _moving(stage, of), 1, most=np.inf)
+        def without(zero: Array) -> dict[str, Array]:
+            return {column: driven.columns[column] - zero[0] * rise}
+
+        return _fit(stage, _moving(stage, without), 1, most=np.inf)
+
+    moves = ("law", law_of(0.0 * one, one, driven.calibration)) if stage.name == "servo" else (channel, one)
+    zero, before, after = fitted(*moves)
     if not explains(stage, before, after):
         return 0.0
-    rival = "schedule_error"
-    if rival in stage.index():
-        judge = LeastSquaresProblem(stage, np.asarray(stage.floor))
-        shifted = judge.fit((rival,), stage.neutral(), 4)
-        if judge.mean_squares(judge.errors(shifted.theta[None])[0]).sum() <= after.sum():
-            return 0.0
+    if stage.outputs == DEMAND and fitted(*DEMAND, one)[2].sum() <= after.sum():
+        return 0.0
     return float(zero[0])
 
 
