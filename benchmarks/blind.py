@@ -1,4 +1,6 @@
-"""What the blind benchmarks share: a run that goes on where it was stopped, what a learned curve is, shares."""
+"""What the blind benchmarks share: a run that goes on where it was stopped, what a log shows, what a learned curve is,
+shares.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +19,17 @@ from scipy.stats import binomtest
 from vaneloop.base import terminal
 from vaneloop.base.errors import InputError
 from vaneloop.base.files import whole
+from vaneloop.identification.least_squares.problem import LeastSquaresProblem
+from vaneloop.identification.vane_chain.chain import Chain
 
 __all__ = [
     "INSIDE", "KINDS", "add_learn_options", "add_result_options", "add_run_options", "as_curve", "check_run",
-    "print_shares", "read_rows", "run", "share", "write_rows",
+    "detected", "print_shares", "read_rows", "run", "share", "write_rows",
 ]  # fmt: skip
 
 Row = dict[str, Any]
 KINDS = ("clean", "outside", "pair", "single")  # of what is hidden; outside: what the library does not have
+SEEN = 3.0  # spreads of a noise floor
 INSIDE = 0.90  # of the visited values: there the truth must be in the band of a curve that is the law
 
 
@@ -137,6 +142,21 @@ def as_curve(law: Any, value: Callable[[Any], Any], forms: Iterable[str]) -> Row
     within = (low <= -off) & (-off <= high)
     given = {f.form for f in law.formulas}
     return {"inside": float(w[within].sum() / w.sum()), "formula": bool(given & set(forms)) if forms else None}
+
+
+def detected(hidden: Chain, clean: Chain) -> bool:
+    """Whether a log shows what is hidden in it: in a subsystem the nominal model's held-out error, refitted, is worse
+    than that of the same machine without it by more than `SEEN` spreads of the floor.
+    """
+    worse = 0.0
+    for s in hidden.stages:
+        without = next((c for c in clean.stages if c.name == s.name), None)
+        if without is None or without.floor is None:
+            continue
+        judges = [LeastSquaresProblem(x, without.floor) for x in (s, without)]
+        a, b = (float(np.sqrt(j.fit((), j.stage.neutral()).held_out.sum() / j.n)) for j in judges)
+        worse = max(worse, (a - b) * np.sqrt(2.0 * judges[1].n))
+    return bool(worse > SEEN)
 
 
 def share(hits: list[bool]) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from benchmarks.blind import (
     add_run_options,
     as_curve,
     check_run,
+    detected,
     print_shares,
     read_rows,
     run,
@@ -44,7 +45,6 @@ from vaneloop.base import terminal
 from vaneloop.base.durations import named_lag, within_no_period
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
-from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.settings import LIKELY
 from vaneloop.identification.vane_chain.chain import build_chain
 from vaneloop.identification.vane_chain.experiment import recommend
@@ -352,24 +352,11 @@ def judge_case(
             said = _learned(chain, d, f"case {index}", h)
         said["also"] = sorted(gone - {h.name})
     truth = [h.name for h in case["hidden"]]
-    # detectable: the nominal model's held-out error, refitted, is worse than on the machine without the effect by 3
-    # spreads of the floor
     detectable = []
     if truth:
         clean = stages_of([])
         for h in case["hidden"]:
-            alone = chain if len(truth) == 1 else stages_of([h])
-            best = 0.0
-            for with_it in alone.stages:
-                without = next((s for s in clean.stages if s.name == with_it.name), None)
-                if without is None or without.floor is None:
-                    continue
-                figures = []
-                for s in (with_it, without):
-                    judge = LeastSquaresProblem(s, without.floor)
-                    figures.append(float(np.sqrt(judge.fit((), s.neutral()).held_out.sum() / judge.n)))
-                best = max(best, (figures[0] - figures[1]) * np.sqrt(2.0 * judge.n))
-            detectable.append(bool(best > 3.0))
+            detectable.append(detected(chain if len(truth) == 1 else stages_of([h]), clean))
     named = [e["effect"] for e in answer["effects"]]
     rivals = {e["effect"]: e["rivals"] for e in answer["effects"]}
     tried = (

@@ -248,7 +248,7 @@ def rest(s: np.ndarray, p: np.ndarray, j: int, stroke: float, n_r: float, t_oil:
     g = GEOMETRY
     c, d = crank(driven_stroke(s, p, j), p[g + G_LX0, j], p[g + G_X1, j], p[g + G_Y1, j], p[g + G_LE, j])
     for k in range(int(p[VANE_COUNT, j])):
-        s[RING + k, j] = s[DRIVEN + k, j] = ring = unloaded_ring_angle(p, j, k, c, d, n_r, t_oil)
+        s[RING + k, j] = s[DRIVEN + k, j] = ring = unloaded_ring_angle(s, p, j, k, c, d, n_r, t_oil)
         stage = stem.prepare(p, j, k)
         s[POT + k, j] = stem.reading(stage, vane_angle(ring, stage.ldp, stage.length), t_oil, 0.0)
     curve.begin(s, p, j, t_oil)  # once more, now that the potentiometers have their angles
@@ -355,10 +355,16 @@ def sample_lvdt(s: np.ndarray, p: np.ndarray, j: int, noise: float, t_oil: float
 
 
 @in_place
-def unloaded_ring_angle(p: np.ndarray, j: int, k: int, c: float, d: float, n_r: float, t_oil: float) -> float:
-    """Return the angle (rad) to which crank direction (c, d) drives the ring of stage ``k``, before its play."""
+def unloaded_ring_angle(
+    s: np.ndarray, p: np.ndarray, j: int, k: int, c: float, d: float, n_r: float, t_oil: float
+) -> float:
+    """Return the angle (rad) to which crank direction (c, d) drives the ring of stage ``k``, with B's of two actuators,
+    before its play.
+    """
     stage = stem.prepare(p, j, k)
     theta = ring_angle(c, d, stage.ax, stage.ay, stage.lb, stage.lc, stage.ld)
+    if p[ACTUATORS, j] != 0.0:
+        theta, _ = unison.ring_at(s, p, j, k, theta)
     return stem.drive(stage, theta, n_r, t_oil, 0.0, True)
 
 
@@ -373,7 +379,7 @@ def stem_angle(
     theta = ring_angle(c, d, stage.ax, stage.ay, stage.lb, stage.lc, stage.ld)
     twist = 0.0
     if p[ACTUATORS, j] != 0.0:
-        theta, twist = unison.ring_at(s, p, j, stage, theta)
+        theta, twist = unison.ring_at(s, p, j, k, theta)
     theta, play = stem.drive(stage, theta, n_r, t_oil, t, True), 0.0
     if p[CURVES, j] != 0.0:
         theta += curve.bend(s, p, j, curve.RING_ADDS) + curve.bend(s, p, j, curve.RING_ADDS + 1 + k)

@@ -14,14 +14,18 @@ from dataclasses import dataclass
 from vaneloop.base.vanes import VANES
 
 __all__ = [
-    "DEG", "HYDRAULIC", "KINDS", "MOTOR", "SITES", "STAGES", "T_REF", "UNITS", "Effect", "Parameter", "per_vane_stage",
+    "DEG", "HYDRAULIC", "KINDS", "MOTOR", "PAIR", "SITES", "STAGES", "T_REF", "UNITS", "Effect", "Parameter",
+    "per_vane_stage",
 ]  # fmt: skip
 
 DEG = math.pi / 180.0
 T_REF = 40.0  # degC: oil temperature at which what grows with temperature is nil
-SITES = ("demand", "engine", "valve", "supply", "amplifier", "motor", "screw", "actuator", "lvdt", "linkage", "pot")
+SITES = (
+    "demand", "engine", "valve", "supply", "amplifier", "motor", "screw", "actuator", "lvdt", "link", "linkage", "pot",
+)  # fmt: skip
 KINDS = ("hydraulic", "electromechanical")  # of actuators, by their number in `plant.layout.KIND`
 HYDRAULIC, MOTOR = KINDS[:1], KINDS[1:]
+PAIR = ("two hydraulic",)  # on the same rings: such a machine has what is of hydraulic ones, too
 STAGES = ("demand", "servo", "engine", "actuator", "linkage")
 
 UNITS = {  # border unit -> factor into SI (speeds stay in %, temperatures in degC)
@@ -90,7 +94,7 @@ class Effect:
     states      names of what it remembers, in the order of the plant's rows
     summary     one line for lists
     excites     what a log must hold for it to show, in words
-    kinds       of actuators, of `KINDS`, that can have it
+    kinds       of actuators, of `KINDS` and `PAIR`, that can have it
     """
 
     name: str
@@ -107,8 +111,8 @@ class Effect:
             raise ValueError(f"{self.name}: site (={self.site!r}) must be one of {', '.join(SITES)}")
         if not self.stages or not set(self.stages) <= set(STAGES):
             raise ValueError(f"{self.name}: stages (={self.stages!r}) must be of {', '.join(STAGES)}")
-        if not self.kinds or not set(self.kinds) <= set(KINDS):
-            raise ValueError(f"{self.name}: kinds (={self.kinds!r}) must be of {', '.join(KINDS)}")
+        if not self.kinds or not set(self.kinds) <= {*KINDS, *PAIR}:
+            raise ValueError(f"{self.name}: kinds (={self.kinds!r}) must be of {', '.join((*KINDS, *PAIR))}")
         if len({p.name for p in self.parameters}) != len(self.parameters) or not self.parameters:
             raise ValueError(f"{self.name}: parameters must be there and have different names")
 

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from plant import chain
-from plant.effect import T_REF, Parameter
+from plant.effect import PAIR, T_REF, Effect, Parameter
 from plant.effects import EFFECTS, ROW, states_of
 from plant.geometry import Geometry, Schedules, load_schedules
 from plant.linkage import G_L, G_LDP, N_CRANK, N_PER_STAGE
@@ -47,6 +47,18 @@ class Plant:
     def sides(self) -> int:
         """How many actuators it has."""
         return self.table.sides
+
+    def can_have(self, effect: Effect) -> bool:
+        """Whether an effect is of its kind of actuator."""
+        return self.kind in effect.kinds or (self.sides == 2 and effect.kinds == PAIR)
+
+    def lacks(self, effect: Effect) -> str:
+        """Why it cannot have an effect, after the effect's name: "is of ...; this machine's ..."; empty if it can."""
+        if self.can_have(effect):
+            return ""
+        if effect.kinds == PAIR:
+            return f"is of {PAIR[0]} actuators on the same rings; this machine has one"
+        return f"is of an actuator of kind {', '.join(effect.kinds)}; this machine's is {self.kind}"
 
     def of_one_actuator(self, what: str) -> None:
         """Refuse a machine with two actuators: InputError in one line, for ``what`` takes one alone."""

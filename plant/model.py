@@ -23,7 +23,8 @@ command as ``--model``.
     values = [-0.61, -0.2, 0.2, 0.29]
 
     [side_b.effects.internal_leakage]       # of two actuators, what B alone has, in place of what both have; side_a
-    coefficient = 5.0                       # likewise. Effects and parameters of valve, actuator and LVDT
+    coefficient = 5.0                       # likewise. Effects and parameters of valve, actuator and LVDT,
+                                            # and effects of its links to the rings
 """
 
 from __future__ import annotations
@@ -276,7 +277,7 @@ class Model(Table):
                     but = "aero_load, flow gain and area" if one_valve else "aero_load"
                     raise InputError(
                         f"{source}: {name}: {key!r} is not of one side; allowed: parameters and effects of {allowed}, "
-                        f"but for {but}"
+                        f"but for {but}; effects of the link"
                     )
             self._check_part(plant, f"{source}: {name}: ", side)
 
@@ -298,11 +299,8 @@ class Model(Table):
                 raise InputError(
                     f"{source}effects: {effect!r} is unknown{_meant(effect, EFFECTS)}; docs/effects.md lists them"
                 )
-            if plant.kind not in EFFECTS[effect].kinds:
-                kinds = ", ".join(EFFECTS[effect].kinds)
-                raise InputError(
-                    f"{source}effects: {effect!r} is of an actuator of kind {kinds}; this machine's is {plant.kind}"
-                )
+            if why := plant.lacks(EFFECTS[effect]):
+                raise InputError(f"{source}effects: {effect!r} {why}")
             allowed = {p.name: p for p in plant.parameters_of(effect).values()}
             for key, value in values.items():
                 if key not in allowed:
@@ -393,7 +391,7 @@ def of_a_side(name: str, one_valve: bool) -> bool:
     """Whether a parameter or an effect can be that of one of two actuators, with a valve each or with one."""
     own = ("actuator", "lvdt") if one_valve else ("valve", "actuator", "lvdt")
     if name in EFFECTS:
-        return EFFECTS[name].site in own and name != "aero_load"
+        return EFFECTS[name].site in (*own, "link") and name != "aero_load"
     if one_valve and name in ("actuator.flow_gain", "actuator.area"):
         return False
     return name.split(".")[0] in own or name == "sensors.lvdt_lag" or "." not in name

@@ -19,12 +19,22 @@ from plant.effects import (
     linkage_wear,
     pot_bias,
     pot_gain,
+    rigging_offset,
     ring_eccentricity,
     thermal_growth,
 )
 from plant.linkage import G_AX, G_AY, G_L, G_LB, G_LC, G_LD, G_LDP, N_CRANK, N_PER_STAGE
 from plant.parameters import GEOMETRY, PLAY, POT_BIAS
-from plant.places import BRISTLE, CRANK_LENGTH_ERROR, DRIVEN, LINK_LENGTH_ERROR, LINKAGE_BACKLASH, POT_BIAS_ERROR, RING
+from plant.places import (
+    BRISTLE,
+    CRANK_LENGTH_ERROR,
+    DRIVEN,
+    LINK_LENGTH_ERROR,
+    LINKAGE_BACKLASH,
+    POT_BIAS_ERROR,
+    RIGGING_OFFSET,
+    RING,
+)
 from plant.play import play_step
 from plant.prepared import with_effects
 from vaneloop.base.compiled import inlined
@@ -44,7 +54,7 @@ class _Stem(NamedTuple):
     """What a stage is, worked out once; behind these fields those of the effects at linkage and potentiometer
     (`plant.prepared`).
 
-    ax, ay, lb, lc, ld  m, of the linkage (`plant.linkage`), errors of length included
+    ax, ay, lb, lc, ld  m, of the linkage (`plant.linkage`), errors of length and of rigging included
     ldp, length, ratio  m, m: clevis and vane lever; ring angle per vane angle
     play                rad total width at the ring, nominal and linkage_backlash
     offset              rad, of the potentiometer
@@ -71,7 +81,7 @@ def _numbers(p: np.ndarray, j: int, k: int) -> _Stem:
         p[o + G_AX, j],
         p[o + G_AY, j],
         crank_length_error.step(p[o + G_LB, j], p[CRANK_LENGTH_ERROR + k, j]),
-        link_length_error.step(p[o + G_LC, j], p[LINK_LENGTH_ERROR + k, j]),
+        rigging_offset.step(link_length_error.step(p[o + G_LC, j], p[LINK_LENGTH_ERROR + k, j]), p[RIGGING_OFFSET, j]),
         p[o + G_LD, j],
         p[o + G_LDP, j],
         p[o + G_L, j],

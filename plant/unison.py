@@ -9,8 +9,9 @@ at the strokes x_A and x_B). It comes to rest between::
     F_B =   dV/dx_B = - sum_k kappa th_B,k' (th_A,k - th_B,k)    on piston B
     th(phi) = 1/2 (th_A + th_B) + 1/2 (th_A - th_B) cos phi      what a vane at phi sees
 
-Symbols: kappa stiffness of a ring between its driven points (N m/rad), ' d/dx (rad/m, `plant.linkage.ring_motion`), phi
-angle around the ring from the point that A drives (rad). The piston ahead is pushed back and the other pulled along.
+Symbols: kappa stiffness of a ring between its driven points (N m/rad; less where one is soft,
+`plant.effects.ring_stiffness`), ' d/dx (rad/m, `plant.linkage.ring_motion`), phi angle around the ring from the point
+that A drives (rad). The piston ahead is pushed back and the other pulled along.
 
 th(phi) is exact for a ring that stays round. It turns by th and shifts sideways by e, held by its rollers and levers;
 a point at phi then moves along the circumference by R th + e cos phi, R radius. At the driven points, phi = 0 and pi,
@@ -37,8 +38,8 @@ flow gain. G is bounded so that the step of 0.1 ms is stable with rings of any s
 
 Limits: the ring does not bend and does not tilt out of its plane. One that stretches evenly between its points is
 linear in phi instead: a vane then sees up to 0.11 (th_A - th_B) less. No mass, no damping of its own. Play acts on the
-mean of both points. At equal strokes nothing of this acts. While one piston stands at its stop, the other does not get
-its oil.
+mean of both points. At equal strokes nothing of this acts, unless the links of one side are set otherwise
+(`plant.effects.rigging_offset`). While one piston stands at its stop, the other does not get its oil.
 Source: kinematics of a rigid body in the plane; virtual work, Lanczos, The Variational Principles of Mechanics (1970),
 ch. III; stiffness of the oil, Merritt (1967), section 6-2.
 """
@@ -51,13 +52,13 @@ import numpy as np
 
 from plant import stem
 from plant.drive import DriveState
-from plant.effects import oil_compressibility
+from plant.effects import oil_compressibility, ring_stiffness
 from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank, crank_slope, ring_angle, ring_motion
 from plant.parameters import GEOMETRY, POT_SHIFT, RING_STIFFNESS, VANE_COUNT
-from plant.places import X
+from plant.places import RING_STIFFNESS_RATIO, X
 from vaneloop.base.compiled import in_place, inlined
 
-__all__ = ["Tie", "energy", "forces", "ring_at", "shared", "tie", "unjoined"]
+__all__ = ["Tie", "energy", "felt", "forces", "ring_at", "shared", "tie", "unjoined", "yielding"]
 
 
 class Tie(NamedTuple):
@@ -92,14 +93,14 @@ def _turning(s: np.ndarray, p: np.ndarray, j: int, side: int) -> float:
 def tie(s: np.ndarray, p: np.ndarray, j: int) -> Tie:
     """Return what joins the pistons in lanes ``j`` (A) and ``j`` + 1 (B) at their strokes."""
     f_a = f_b = k_a = k_b = k_ab = 0.0
-    kappa = p[RING_STIFFNESS, j]
+    kappa = p[RING_STIFFNESS, j] * yielding(p, j)[0]
     c_a, e_a = _crank(s, p, j, j)
     c_b, e_b = _crank(s, p, j, j + 1)
     turning_a, turning_b = _turning(s, p, j, j), _turning(s, p, j, j + 1)
     for k in range(int(p[VANE_COUNT, j])):
-        d = stem.prepare(p, j, k)
+        d, d_b = stem.prepare(p, j, k), stem.prepare(p, j + 1, k)
         theta_a, slope_a = ring_motion(turning_a, c_a, e_a, d.ax, d.ay, d.lb, d.lc, d.ld)
-        theta_b, slope_b = ring_motion(turning_b, c_b, e_b, d.ax, d.ay, d.lb, d.lc, d.ld)
+        theta_b, slope_b = ring_motion(turning_b, c_b, e_b, d_b.ax, d_b.ay, d_b.lb, d_b.lc, d_b.ld)
         torque = kappa * (theta_a - theta_b)
         f_a += slope_a * torque
         f_b -= slope_b * torque
@@ -133,22 +134,41 @@ def forces(t: Tie, w_a: float, w_b: float, c_a: float, c_b: float) -> tuple[floa
 
 
 @inlined
-def shared(theta_a: float, theta_b: float, shift: float) -> tuple[float, float]:
-    """Return the angle (rad) of a ring that A alone would turn to ``theta_a`` and B to ``theta_b``, and what its
-    potentiometer's place adds: ``shift`` = 1/2 cos phi of their difference.
+def felt(load: float, slope: float, w: float, c: float) -> float:
+    """Return the rings' load (N, against extension) on a piston beside another of known stroke. It would be at ``w``
+    (m) without them, with oil of compliance ``c`` (m/N) behind; ``load`` (N) at stroke 0, and its ``slope`` (N/m).
     """
+    return (load + slope * w) / (1.0 + slope * c)
+
+
+@inlined
+def yielding(p: np.ndarray, j: int) -> tuple[float, float, float]:
+    """Return what is left of the rings' stiffness between both sides, and the shares by which their points give way
+    (`plant.effects.ring_stiffness`).
+    """
+    return ring_stiffness.step(p[RING_STIFFNESS_RATIO, j], p[RING_STIFFNESS_RATIO, j + 1])
+
+
+@inlined
+def shared(theta_a: float, theta_b: float, shift: float, give_a: float, give_b: float) -> tuple[float, float]:
+    """Return the angle (rad) of a ring that A alone would turn to ``theta_a`` and B to ``theta_b``, and what its
+    potentiometer's place adds: ``shift`` = 1/2 cos phi of their difference. The driven points give way by the shares
+    ``give_a`` and ``give_b`` of it.
+    """
+    between = theta_a - theta_b
+    theta_a, theta_b = theta_a - give_a * between, theta_b + give_b * between
     return 0.5 * (theta_a + theta_b), shift * (theta_a - theta_b)
 
 
 @inlined
-def ring_at(s: np.ndarray, p: np.ndarray, j: int, d: Any, theta: float) -> tuple[float, float]:
-    """Return the angle (rad) of a ring that actuator A alone would turn to ``theta``, the mean of both, and what its
-    potentiometer's place adds.
-
-    d  of the ring's stage, `plant.stem.prepare`
+def ring_at(s: np.ndarray, p: np.ndarray, j: int, k: int, theta: float) -> tuple[float, float]:
+    """Return the angle (rad) of ring ``k``, which actuator A alone would turn to ``theta``, the mean of both, and what
+    its potentiometer's place adds.
     """
     c, e = _crank(s, p, j, j + 1)
-    return shared(theta, ring_angle(c, e, d.ax, d.ay, d.lb, d.lc, d.ld), p[POT_SHIFT, j])
+    d = stem.prepare(p, j + 1, k)
+    _, give_a, give_b = yielding(p, j)
+    return shared(theta, ring_angle(c, e, d.ax, d.ay, d.lb, d.lc, d.ld), p[POT_SHIFT, j], give_a, give_b)
 
 
 @in_place
@@ -158,8 +178,8 @@ def energy(s: np.ndarray, p: np.ndarray, j: int) -> float:
     c_a, e_a = _crank(s, p, j, j)
     c_b, e_b = _crank(s, p, j, j + 1)
     for k in range(int(p[VANE_COUNT, j])):
-        d = stem.prepare(p, j, k)
+        d, d_b = stem.prepare(p, j, k), stem.prepare(p, j + 1, k)
         theta_a = ring_angle(c_a, e_a, d.ax, d.ay, d.lb, d.lc, d.ld)
-        theta_b = ring_angle(c_b, e_b, d.ax, d.ay, d.lb, d.lc, d.ld)
-        total += 0.5 * p[RING_STIFFNESS, j] * (theta_a - theta_b) ** 2
+        theta_b = ring_angle(c_b, e_b, d_b.ax, d_b.ay, d_b.lb, d_b.lc, d_b.ld)
+        total += 0.5 * p[RING_STIFFNESS, j] * yielding(p, j)[0] * (theta_a - theta_b) ** 2
     return total

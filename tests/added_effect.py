@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.effects_page import page
 from hil.loop.lanes import lockstep_lanes
 from hil.loop.lockstep import Stimulus, lockstep
 from plant import Model, Plant, build_plant, chain
-from plant.effects_page import page
 from plant.parameters import derive
 from plant.places import POT
 from plant.stages import linkage, linkage_run

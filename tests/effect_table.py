@@ -87,6 +87,10 @@ EXAMPLES: dict[str, Example] = {
     "ring_eccentricity": Example(
         {"vgv1": 0.2, "phase": 60.0}, {"vgv1": 0.5, "phase": 60.0}, lambda e, n, a, b, c: (e.step(a, n[0], n[3]), a)
     ),
+    "rigging_offset": Example({"length": 0.5}, {"length": 2.0}, lambda e, n, a, b, c: (e.step(c, *n), c)),
+    "ring_stiffness": Example(
+        {"ratio": 0.5}, {"ratio": 0.1}, lambda e, n, a, b, c: (e.step(n[0], n[0]), (1.0, 0.0, 0.0))
+    ),
     "pot_bias": Example({"vgv1": 0.5}, {"vgv1": 1.0}, lambda e, n, a, b, c: (e.step(a, n[0]), a)),
     "pot_gain": Example({"vgv1": 1.03}, {"vgv1": 1.1}, lambda e, n, a, b, c: (e.step(a, n[0]), a)),
     "pot_lag": Example({"vgv1": 0.05}, {"vgv1": 0.1}, lambda e, n, a, b, c: (e.step(c, n[0]), c)),

@@ -14,7 +14,10 @@ import pytest
 from tests.conftest import ROOT
 
 PAGE = (ROOT / "docs" / "add_an_effect.md").read_text(encoding="utf-8")
-COPIED = ("controller", "plant", "hil", "vaneloop", "tables", "tests", "examples", "docs/effects.md", "pyproject.toml")
+COPIED = (
+    "controller", "plant", "hil", "vaneloop", "tables", "tests", "benchmarks", "examples", "docs/effects.md",
+    "pyproject.toml",
+)  # fmt: skip
 JUNK = shutil.ignore_patterns("__pycache__", "ahead")
 
 

@@ -14,12 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
+from benchmarks.effects_page import page
 from controller import load_calibration, new_state
 from hil.loop.lockstep import Stimulus, lockstep
 from hil.loop.tick import flashed
 from plant import Model, build_plant, chain, load_model, places, write_model
 from plant import effects as library
-from plant.effect import DEG, KINDS, MOTOR, STAGES
+from plant.effect import DEG, KINDS, MOTOR, PAIR, STAGES
 from plant.effects import (
     EFFECTS,
     ROW,
@@ -35,7 +36,6 @@ from plant.effects import (
     supply_pressure_droop,
     valve_hysteresis,
 )
-from plant.effects_page import page
 from plant.geometry import vane_angles
 from plant.layout import GEOMETRY, N_NOMINAL
 from plant.linkage import G_LB, G_LC, N_CRANK, N_PER_STAGE
@@ -54,6 +54,7 @@ MACHINE = build_plant()
 OWN = {name: tuple(MACHINE.parameters_of(name).values()) for name in NAMES}  # of the shipped machine
 
 SIZES = {name: example.plain for name, example in EXAMPLES.items()}
+ALONE = [n for n in NAMES if EFFECTS[n].kinds != PAIR]  # those of a pair: tests/test_two_actuators.py
 ELECTRIC = [n for n in NAMES if EFFECTS[n].kinds == MOTOR]
 
 
@@ -118,7 +119,7 @@ def test_docstring_has_its_sections(name: str) -> None:
 
 def test_page_on_effects_is_current() -> None:
     assert (ROOT / "docs" / "effects.md").read_text(encoding="utf-8") == page(), (
-        "run: python -m plant.effects_page > docs/effects.md"
+        "run: python -m benchmarks.effects_page > docs/effects.md"
     )
 
 
@@ -257,7 +258,7 @@ def stage_outputs():
     out = {}
     for electric in (False, True):
         base = machine_with(base_of(*ELECTRIC[: int(electric)]), aero_load={"force": 2000.0})
-        sets = [{}, *({name: SIZES[name]} for name in NAMES if (name in ELECTRIC) == electric)]
+        sets = [{}, *({name: SIZES[name]} for name in ALONE if (name in ELECTRIC) == electric)]
         wide = {
             "actuator": actuator_lanes(sets, base)[0],
             "linkage": linkage_lanes(sets, base)[0],
@@ -270,7 +271,7 @@ def stage_outputs():
     return out
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ALONE)
 def test_effect_shows_in_every_stage_it_declares_and_in_no_other(name: str, stage_outputs) -> None:
     with_it, without = stage_outputs[name], stage_outputs[name in ELECTRIC]
     # blocks of lanes and single ones differ by rounding
@@ -298,7 +299,7 @@ def test_any_parameters_within_their_bounds_keep_every_stage_finite(kind: str) -
     assert np.all((s[places.X] >= 0.0) & (s[places.X] <= 0.048))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ALONE)
 def test_effect_changes_the_closed_loop_and_keeps_it_finite(name: str) -> None:
     load = {} if name == "aero_load" else {"aero_load": {"force": 2000.0}}
     stimulus = Stimulus.of(log()["n_dem"], t_oil=log()["t_oil"])

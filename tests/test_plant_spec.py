@@ -11,19 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from plant import (
-    Model,
-    build_plant,
-    chain,
-    chain_lanes,
-    curve,
-    effects_page,
-    lanes,
-    linkage,
-    load_geometry,
-    load_model,
-    write_model,
-)
+from benchmarks import effects_page
+from plant import Model, build_plant, chain, chain_lanes, curve, lanes, linkage, load_geometry, load_model, write_model
 from plant import model as model_module
 from plant.curve import PLACES, QUANTITIES, at_curve, quantity_of
 from plant.curve_lanes import alike

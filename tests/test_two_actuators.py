@@ -20,6 +20,7 @@ from scipy.optimize import brentq
 
 import vaneloop
 from controller.calibration import CalibrationTable
+from hil import inject
 from hil.fmu import write_fmu
 from hil.logs import read_log
 from hil.loop.engines import lockstep_engines
@@ -28,8 +29,8 @@ from hil.loop.lockstep import Run, Stimulus, lockstep, snapshot_names
 from hil.replay import replay
 from plant import Model, Plant, build_plant, chain, load_model, unison, write_model
 from plant.effects import ROW, oil_compressibility
-from plant.linkage import stage_vane_angle
-from plant.model import Side
+from plant.linkage import G_LC, N_CRANK, N_PER_STAGE, stage_vane_angle
+from plant.model import SIDE_NAMES, Side
 from plant.parameters import AREA, LINE_CONDUCTANCE, PLAY, POT_POSITION, RING_STIFFNESS, derive
 from plant.places import GIVE, POT, READING, RING, X_LVDT, X
 from tests.test_tables import document
@@ -116,6 +117,92 @@ def test_shut_in_pistons_come_to_rest_as_springs_in_series_do(kappa: float, betw
     assert s[X, 0] - s[X, 1] == pytest.approx(between / (1.0 + 2.0 * C * k), rel=2e-4)
     assert -s[GIVE, 0] / C == pytest.approx(k * (s[X, 0] - s[X, 1]), rel=2e-3, abs=1e-6)
     assert s[X].sum() == pytest.approx(48e-3, abs=abs(between) * 1e-3)
+
+
+def of_side(side: str, **effects: dict[str, float]) -> Model:
+    return Model(**{side: Side(effects=effects)})
+
+
+def ring_of(plant: Plant, x: float, k: int, longer: float = 0.0) -> float:
+    """Angle (rad) of ring ``k`` at a stroke (m) with a vertical link that is ``longer`` (m): lever and link undone."""
+    g = plant.geometry.arrays().copy()
+    g[N_CRANK + k * N_PER_STAGE + G_LC] += longer
+    ldp, lever = plant.lever(k)
+    return math.atan(lever * math.sin(stage_vane_angle(x, g, k)) / ldp)
+
+
+@pytest.mark.parametrize("length", [-1e-3, 5e-4])
+@pytest.mark.parametrize("side", [0, 1])
+def test_links_set_too_long_load_both_pistons_at_equal_strokes(side: int, length: float) -> None:
+    """F_A = sum kappa th_A' (th_A - th_B), F_B = - sum kappa th_B' (th_A - th_B): a longer link turns its ring back."""
+    plant = of_side(SIDE_NAMES[side], rigging_offset={"length": 1e3 * length}).plant(TWO)
+    x, h = 24e-3, 1e-6
+    tie = unison.tie(at(plant, x, x), plant.p, 0)
+    own = (length, 0.0) if side == 0 else (0.0, length)
+    loads = [0.0, 0.0]
+    for k in range(len(plant.vanes)):
+        torque = KAPPA * (ring_of(plant, x, k, own[0]) - ring_of(plant, x, k, own[1]))
+        for j, sign in enumerate((1.0, -1.0)):
+            slope = (ring_of(plant, x + h, k, own[j]) - ring_of(plant, x - h, k, own[j])) / (2.0 * h)
+            loads[j] += sign * slope * torque
+    assert (tie.f_a, tie.f_b) == pytest.approx(tuple(loads), rel=1e-6)
+    assert (tie.f_a < 0.0) == ((length > 0.0) == (side == 0)) and tie.f_a * tie.f_b < 0.0
+
+
+@pytest.mark.parametrize("length", [-1.0, 0.5])
+def test_shut_in_pistons_share_a_rigging_offset_as_springs_in_series_do(length: float) -> None:
+    """Pistons at equal strokes give way by C F each: x_A - x_B = - 2 C F, F = F_0 / (1 + 2 C K)."""
+    plant = of_side("side_b", rigging_offset={"length": length}).plant(TWO)
+    s = at(plant, 24e-3, 24e-3)
+    tie = unison.tie(s, plant.p, 0)
+    drive(plant, s, 0.05)
+    force = (tie.f_a - tie.f_b) / 2.0 / (1.0 + C * ((tie.k_a + tie.k_b) / 2.0 + tie.k_ab))
+    assert s[X, 0] - s[X, 1] == pytest.approx(-2.0 * C * force, rel=3e-3)
+
+
+def test_both_sides_off_alike_load_no_piston_and_mirrored_ones_change_places() -> None:
+    links = {"rigging_offset": {"length": 1.0}}
+    tie = unison.tie(at(TWO, 24e-3, 24e-3), Model(effects=links).plant(TWO).p, 0)
+    assert tie.f_a == tie.f_b == 0.0
+    a, b = (run(of_side(side, **links).plant(TWO), DEMAND[:600]).columns for side in SIDE_NAMES)
+    assert np.allclose(a["x_lvdt_a"], b["x_lvdt_b"], rtol=0.0, atol=1e-9)
+    assert np.allclose(a["vigv"], b["vigv"], rtol=0.0, atol=1e-9)
+    assert np.ptp(a["x_lvdt_a"] - a["x_lvdt_b"]) > 0.01
+
+
+@pytest.mark.parametrize("ratio", [0.5, 0.1])
+def test_a_soft_point_is_a_spring_in_series_and_the_ring_leans_to_the_stiff_side(ratio: float) -> None:
+    """1 / kappa' = 1 / kappa + (1 - r) / (r kappa); a vane half-way sees (1 - r/2) th_A + (r/2) th_B of a soft B."""
+    x_a, x_b = 24.5e-3, 23.5e-3
+    stiff = unison.tie(at(TWO, x_a, x_b), TWO.p, 0)
+    for side in SIDE_NAMES:
+        plant = of_side(side, ring_stiffness={"ratio": ratio}).plant(TWO)
+        s = at(plant, x_a, x_b)
+        soft = unison.tie(s, plant.p, 0)
+        left = 1.0 / (1.0 + (1.0 - ratio) / ratio)
+        assert tuple(soft[2:]) == pytest.approx(tuple(left * v for v in stiff[2:]), rel=1e-12)
+        share = ratio / 2.0 if side == "side_b" else 1.0 - ratio / 2.0
+        for k in range(len(plant.vanes)):
+            th_a, th_b = ring_of(plant, x_a, k), ring_of(plant, x_b, k)
+            ring, _ = unison.ring_at(s, plant.p, 0, k, th_a)
+            assert ring == pytest.approx((1.0 - share) * th_a + share * th_b, abs=1e-9)
+
+
+def test_soft_points_at_both_sides_add_their_compliances() -> None:
+    both = {
+        side: Side(effects={"ring_stiffness": {"ratio": r}}) for side, r in zip(SIDE_NAMES, (0.5, 0.25), strict=True)
+    }
+    left, give_a, give_b = unison.yielding(Model(**both).plant(TWO).p, 0)
+    assert 1.0 / left == pytest.approx(1.0 + 1.0 + 3.0)
+    assert (give_a, give_b) == pytest.approx((0.2, 0.6)) and left + give_a + give_b == pytest.approx(1.0)
+
+
+def test_one_actuator_has_no_side_to_be_rigged_wrong() -> None:
+    for name in ("rigging_offset", "ring_stiffness"):
+        with pytest.raises(InputError, match=f"{name}' is of two hydraulic actuators on the same rings; .* has one$"):
+            Model(effects={name: {}}).check(ONE)
+        with pytest.raises(InputError, match=f"effect {name} is of two hydraulic actuators on the same rings"):
+            inject.run(inject.Scenario(title="made", duration=1.0, inject=[inject.Machine(effect=name)]), plant=ONE)
 
 
 def test_leakage_lets_the_strokes_come_together_with_the_time_of_the_springs() -> None:

@@ -86,10 +86,14 @@ def test_shares_count_clean_logs_and_the_stiffness_apart() -> None:
         row("side_b.lvdt_gain", {"side_a.lvdt_gain": []}) | {"kind": "lvdt_gain"},
         row("linkage_backlash", {}, "unknown") | {"kind": "linkage_backlash"},
     ]
-    s = summary([r | {"outcome": outcome(r), "elapsed_s": 2.0} for r in rows])
+    seen = [False, False, True, True, True, False]
+    s = summary(
+        [r | {"outcome": outcome(r), "elapsed_s": 2.0, "detectable": d} for r, d in zip(rows, seen, strict=True)]
+    )
     count = {k: (v["hits"], v["of"]) for k, v in s.items() if isinstance(v, dict)}
     assert count == {
         "hidden: named or among rivals": (1, 3), "of one side: named or among rivals": (1, 2),
+        "detectable: named or among rivals": (1, 2), "detectable: alone or first of its rivals": (1, 2),
         "of one side: named alone": (1, 2), "where effects are named: wrong": (1, 2),
         "stiffness of the rings off: at the end of its tolerance": (1, 1),
         "stiffness of the rings right: at the end of its tolerance": (0, 5),

@@ -216,11 +216,13 @@ def _rows(ident: int, data: np.ndarray) -> np.ndarray:
     return rows
 
 
+_KEPT = np.array([*((1 << 8 * n) - 1 for n in range(8)), -1])  # of a frame's data, by its length
+
+
 def _cut(rows: np.ndarray, length: np.ndarray) -> np.ndarray:
     """Give frames another length; bytes behind it are 0."""
-    kept = np.where(length >= 8, -1, (np.int64(1) << (8 * np.minimum(length, 7))) - 1)
     rows[:, 0] = rows[:, 0] & ~np.int64(0xFF << 32) | length << 32
-    rows[:, 1] &= kept
+    rows[:, 1] &= _KEPT[np.minimum(length, 8)]
     return rows
 
 

@@ -216,8 +216,8 @@ def lacks(scenario: Scenario, plant: Plant, calibration: Calibration | None = No
         if isinstance(a, Machine):
             if a.p_s is not None and plant.kind != "hydraulic":
                 return f"machine: p_s: the {plant.kind} actuator takes no oil"
-            if a.effect is not None and plant.kind not in EFFECTS[a.effect].kinds:
-                return f"machine: effect {a.effect}: not of an actuator of kind {plant.kind}"
+            if a.effect is not None and (why := plant.lacks(EFFECTS[a.effect])):
+                return f"machine: effect {a.effect} {why}"
     return ""
 
 

@@ -140,7 +140,7 @@ def _nothing(*_: Any) -> None:
     """What only strategies inverse and adaptive, curves, motors and second actuators need: these engines have none."""
 
 
-def _still(s: Any, p: Any, j: int, d: Any, theta: float) -> tuple[float, float]:
+def _still(s: Any, p: Any, j: int, k: int, theta: float) -> tuple[float, float]:
     """What a second actuator makes of a ring; these engines have none."""
     return theta, 0.0
 

@@ -131,8 +131,8 @@ def left(folder: Path) -> Box | None:
         try:
             about = json.loads(name.read_text(encoding="utf-8"))
             ticks, rows = int(head[ENTERED]), (file.stat().st_size // 8 - _HEAD) // len(INPUTS)
-            first, count = (0, ticks) if 0 <= ticks <= rows else ((ticks - 1) % rows, 1) if rows == 1 else (0, 0)
-            kept = np.fromfile(file, np.float64, count * len(INPUTS), offset=8 * (_HEAD + first * len(INPUTS)))
+            count = ticks if 0 <= ticks <= rows else int(rows == 1)
+            kept = np.fromfile(file, np.float64, count * len(INPUTS), offset=8 * _HEAD)
             reason = int(head[REASON]) if head[REASON] in REASONS else 0
             return Box(
                 about["controller"], about["calibration"], CALLS[int(head[CALL])], ticks - 1,

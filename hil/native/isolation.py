@@ -121,11 +121,11 @@ def _watched(task: Callable[[], Any], folder: Path, every_tick: bool, patience: 
 def _wait(guard: int) -> None:
     """Wait for the guard, and wake it where somebody stopped it."""
     ends: list[int] = []
-    with contextlib.suppress(OSError):  # an older kernel has none: it is looked at more often
+    with contextlib.suppress(OSError):  # an older kernel has none: its end is seen at the next look
         ends.append(os.pidfd_open(guard))
     try:
         while True:
-            select.select(ends, [], [], _LOOK if ends else 0.1 * _LOOK)
+            select.select(ends, [], [], _LOOK)
             found, status = os.waitpid(guard, os.WNOHANG | os.WUNTRACED)
             if found and not os.WIFSTOPPED(status):
                 return
@@ -207,7 +207,6 @@ def _name(number: int) -> str:
 
 def _guard(task: Callable[[], Any], folder: Path, every_tick: bool, patience: float, mask: set[Any]) -> NoReturn:
     """Be the guard: start the process with the controller, wait for its end, end what it started, say how it ended."""
-    code = 1
     try:
         os.setsid()  # Ctrl-C comes to the caller, which passes it on
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -220,9 +219,8 @@ def _guard(task: Callable[[], Any], folder: Path, every_tick: bool, patience: fl
         end = _watch(child, folder, patience)
         _end_others(child)
         (folder / "end").write_text(json.dumps(end), encoding="utf-8")
-        code = 0
     finally:
-        os._exit(code)
+        os._exit(0)  # what matters it has written
 
 
 def _prctl(option: int, value: int) -> None:

@@ -11,7 +11,7 @@ from plant.effects import CURVES, aero_load
 from plant.parameters import ACTUATORS, DRIVE_EFFECTS, KIND, LVDT_FACTOR, LVDT_LAG, LVDT_SHARE, VALVE_SHARE
 from plant.places import AERO_LOAD, LVDT_LAG_ERROR, READING, SCREW_PITCH_ERROR, VALVE_LAG, X_LVDT, X
 from plant.stages import hydraulic_blocks, motor_blocks
-from plant.stages.blocks import NOTHING, W, between, in_blocks, on_all_cores, parts_of
+from plant.stages.blocks import NO_RINGS, NOTHING, W, between, in_blocks, on_all_cores, parts_of
 from vaneloop.base.compiled import compiled_free
 
 __all__ = ["actuator_run"]
@@ -31,7 +31,7 @@ def actuator_run(
     x_lvdt: np.ndarray | None = None,
     window: int = 0,
     known: np.ndarray = NOTHING,
-    pushed: np.ndarray = NOTHING,
+    rings: np.ndarray = NO_RINGS,
 ) -> None:
     """Fill out[k, lane] with the stroke (m) as the LVDT gives it at sample k, without noise. ``s`` is moved on.
 
@@ -42,8 +42,8 @@ def actuator_run(
                       saw it, so that a small error of speed does not carry it away; without them it starts from ``s``
                       and runs free
     known             signals of curves (`plant.curve.take`); the current's is that of every step
-    pushed            float64[lanes, samples] N against extension: of one of two actuators, what the rings do to its
-                      piston (`plant.stages.ring_loads`); its ``p`` has its share of the air's load. None: no rings
+    rings             float64[2, lanes, samples]: of one of two actuators, what the rings do to its piston
+                      (`plant.stages.ring_loads`); its ``p`` has its share of the air's load
 
     The lags' shares in ``p`` are set to h / (h + tau): over long steps h this keeps the delay of a ramp exact, where
     the share of a constant input, 1 - exp(-h / tau), would be early by h / 2.
@@ -75,7 +75,7 @@ def actuator_run(
         elif part.start < wide:
             block = np.empty(1, hydraulic_blocks.BLOCK)
             hydraulic_blocks.run(
-                current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, block, known, needed, pushed
+                current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, block, known, needed, rings
             )
         else:
             _actuator_lanes(current, n_r, p_s, t_oil, dt, p, s, out.T, x, window, some, known)

@@ -10,9 +10,10 @@ import numpy as np
 from vaneloop.base.compiled import inlined, threads
 from vaneloop.base.side_by_side import side_by_side
 
-__all__ = ["NOTHING", "W", "between", "in_blocks", "on_all_cores", "parts_of", "put_where_seen"]
+__all__ = ["NOTHING", "NO_RINGS", "W", "between", "in_blocks", "on_all_cores", "parts_of", "put_where_seen"]
 
 NOTHING = np.empty((0, 0))  # where no lane has a curve
+NO_RINGS = np.empty((2, 0, 0))  # of an actuator alone
 W = 8  # lanes in a block of the actuator: two vectors of four; more do not run faster
 
 # A block's memory comes from the caller, who keeps it: a record that compiled code takes out of an array of its own

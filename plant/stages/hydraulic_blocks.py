@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from plant import chain, curve, drive, lanes, lvdt
+from plant import chain, curve, drive, lanes, lvdt, unison
 from plant.curve_lanes import CURRENT as OF_CURRENT
 from plant.curve_lanes import first_curved, gives, gives_each, of_signal, site_of, tables_of
 from plant.effects import valve_flow_saturation, valve_null_bias
@@ -37,8 +37,9 @@ WAYS = np.array([
     )
 ])  # fmt: skip
 
-# flow gain and load without curves; the current that would hold the spool, and by how much curves shut its lands
-_BESIDE = ("logged", "gain", "bare_load", "holds", "shut")
+# flow gain and load without curves; the current that would hold the spool, and by how much curves shut its lands; what
+# the rings do to one of two pistons: the load at stroke 0, its slope, and by how much these grow in a plant step
+_BESIDE = ("logged", "gain", "bare_load", "holds", "shut", "ring_load", "ring_slope", "ring_load_by", "ring_slope_by")
 BLOCK = lanes.block(W, drive.DriveState, drive.Drive, drive.Feed, drive.Plays, lvdt.Lvdt, more=(*_BESIDE, *BENT))
 _state, _put_state = lanes.getter(drive.DriveState), lanes.putter(drive.DriveState)
 _drive, _put_drive = lanes.getter(drive.Drive), lanes.putter(drive.Drive)
@@ -79,16 +80,16 @@ def run(
     block: np.ndarray,
     known: np.ndarray,
     needed: np.ndarray,
-    pushed: np.ndarray,
+    rings: np.ndarray,
 ) -> None:
     """The lanes of ``order``, eight at a time; out[lane, k]. ``block``: memory for one record `BLOCK`; ``known``:
-    signals of curves (`plant.curve.take`); ``needed``: what each lane of ``p`` `needs`; ``pushed``: loads beside the
-    air's (`plant.stages.actuator.actuator_run`).
+    signals of curves (`plant.curve.take`); ``needed``: what each lane of ``p`` `needs`; ``rings``: what they do to one
+    of two pistons (`plant.stages.actuator.actuator_run`).
     """
     n, substeps = current.shape
     h = dt / substeps
     b = block[0]
-    rated = p[RATED_CURRENT, 0]
+    rated, joined = p[RATED_CURRENT, 0], rings.shape[1] > 0
     need = np.empty(len(NEEDS), np.bool_)
     for j0 in range(0, len(order), W):
         last = min(W, len(order) - j0)
@@ -124,13 +125,16 @@ def run(
                     for j in range(W):
                         b.load[j] = b.bare_load[j] = drive.load_of(_drive(b, j), speed)
                         b.half_share[j] = drive.half_share(_drive(b, j), supply)
-                    if pushed.shape[0] > 0:
+                    if joined:
                         for j in range(W):
-                            b.load[j] += between(pushed[order[j0 + min(j, last - 1)]], k)
+                            q = order[j0 + min(j, last - 1)]
+                            b.ring_load[j], b.ring_slope[j] = rings[0, q, k - 1], rings[1, q, k - 1]
+                            b.ring_load_by[j] = (rings[0, q, k] - rings[0, q, k - 1]) / substeps
+                            b.ring_slope_by[j] = (rings[1, q, k] - rings[1, q, k - 1]) / substeps
                 else:
                     for j in range(W):
                         b.root[j] = drive.root(_drive(b, j), supply)
-                _go(way, b, current, k, rated, supply, h, p, first, known, tables, some)
+                _go(way, b, current, k, rated, supply, h, joined, p, first, known, tables, some)
             if first >= 0:
                 bend_reading(b, p, first, known, k, tables, some)
             if window > 0 and k % window == 0:
@@ -183,6 +187,7 @@ def _substeps(
     rated: float,
     p_s: float,
     h: float,
+    joined: bool,
     p: np.ndarray,
     q: int,
     known: np.ndarray,
@@ -195,7 +200,8 @@ def _substeps(
     limited: bool,
     curved: bool,
 ) -> None:
-    """The plant steps of row ``k`` of ``current`` (A), of every lane of the block; ``rated`` (A): that of them all.
+    """The plant steps of row ``k`` of ``current`` (A), of every lane of the block; ``rated`` (A): that of them all;
+    ``joined``: rings join each to another piston.
 
     The flags say what is not left out (`NEEDS`). ``curved``: lanes ``some`` have curves, ``q`` is one that has them.
     """
@@ -207,6 +213,13 @@ def _substeps(
         i_cmd = current[k, m]
         if curved:
             _bend(b, p, q, known, k, i_cmd, h, opens, tables, some)
+        if loaded and joined:
+            for j in range(W):
+                load = b.bare_load[j] + (b.load_adds[j] if curved else 0.0)
+                w = unison.unjoined(_state(b, j), _drive(b, j), load, h)
+                b.ring_load[j] += b.ring_load_by[j]
+                b.ring_slope[j] += b.ring_slope_by[j]
+                b.load[j] = load + unison.felt(b.ring_load[j], b.ring_slope[j], w, 1.0 / b.stiffness[j])
         share = valve_null_bias.step(i_cmd, 0.0) / rated
         for j in range(W):
             if not memory and not limited:  # all lanes have the same current: it is divided once
@@ -257,7 +270,7 @@ def _bend(
             b.shut[j] = -b.shut[j] / b.rated[j]
 
 
-_REST = "b, current, k, rated, p_s, h, p, q, known, tables, some"
+_REST = "b, current, k, rated, p_s, h, joined, p, q, known, tables, some"
 _go = lanes.compiled_text(  # `_substeps` of a way: in each the compiler knows the flags
     f"def f(way, {_REST}):\n"
     + "".join(f"    if way == {i}: substeps({_REST}, {', '.join(map(str, way))})\n" for i, way in enumerate(WAYS)),

@@ -11,10 +11,18 @@ import numpy as np
 from plant import chain, curve, lanes, linkage_lanes, lvdt, stem, unison
 from plant.chain import straightened, true_stroke
 from plant.curve_lanes import alike, first_curved, gives, site_of, tables_of
-from plant.effects import CURVES, pot_lag
+from plant.effects import CURVES, pot_lag, ring_stiffness
 from plant.linkage import G_LE, G_LX0, G_X1, G_Y1, crank
 from plant.parameters import GEOMETRY, LVDT_LAG, POT_LAG, POT_SHIFT
-from plant.places import LINKAGE_FRICTION, LVDT_LAG_ERROR, POT, POT_LAG_ERROR, RING_ECCENTRICITY, X
+from plant.places import (
+    LINKAGE_FRICTION,
+    LVDT_LAG_ERROR,
+    POT,
+    POT_LAG_ERROR,
+    RING_ECCENTRICITY,
+    RING_STIFFNESS_RATIO,
+    X,
+)
 from plant.stages.blocks import NOTHING, in_blocks, on_all_cores, parts_of
 from vaneloop.base.compiled import compiled_free, inlined
 
@@ -147,7 +155,7 @@ _BENT = ("lvdt_adds", "lvdt_times", "crank_adds")
 _BENT_OF_STAGE = ("ring_adds", "play_adds", "pot_adds", "pot_times")
 _OF_STAGE = (
     (stem.StemState, stem.Stem),
-    ("pot", "before", "theta", "twist", "e", "b", "lever", "span", "half", *_BENT_OF_STAGE),
+    ("pot", "before", "theta", "twist", "e", "b", "lever", "span", "half", "span_b", "half_b", *_BENT_OF_STAGE),
 )  # fmt: skip
 
 
@@ -155,7 +163,7 @@ _OF_STAGE = (
 def _linkage(stages: int) -> np.dtype[np.void]:
     """Block for that many stages: the compiler knows how often its loops over them go."""
     # late: s, by which the LVDT trails the stroke
-    more = ("late", "stroke", "c", "d", "c_b", "d_b", "shift", *_BENT)
+    more = ("late", "stroke", "c", "d", "c_b", "d_b", "shift", "give_a", "give_b", *_BENT)
     return lanes.block(WIDE, linkage_lanes.Crank, lvdt.Lvdt, more=more, each=(stages, *_OF_STAGE))
 
 
@@ -200,12 +208,19 @@ def _linkage_blocks(
             b.late[j], b.shift[j] = max(p[LVDT_LAG, q], 0.0) + p[LVDT_LAG_ERROR, q], p[POT_SHIFT, q]
             _put_lvdt(b, j, lvdt.prepare(p, q))
             bent |= lvdt.bends(p, q)
+            if two:
+                _, b.give_a[j], b.give_b[j] = ring_stiffness.step(
+                    p[RING_STIFFNESS_RATIO, q], p_b[RING_STIFFNESS_RATIO, q]
+                )
             for k in range(b.pot.shape[0]):
                 d = stem.prepare(p, q, k)
                 _put_stem(b, k, j, d)
                 _put_stem_state(b, k, j, stem.taken(s, q, k))
                 b.pot[k, j], b.lever[k, j] = s[POT + k, q], d.ldp / d.length
                 b.span[k, j], b.half[k, j] = linkage_lanes.ring_numbers(d.lc, d.ld)
+                if two:
+                    d_b = stem.prepare(p_b, q, k)
+                    b.span_b[k, j], b.half_b[k, j] = linkage_lanes.ring_numbers(d_b.lc, d_b.ld)
                 b.e[k, j], b.b[k, j] = _ramp_lag(pot_lag.step(p[POT_LAG, q], p[POT_LAG_ERROR + k, q]), dt)
                 rubbed |= d.linkage_friction != 0.0
                 eccentric |= d.ring_eccentricity != 0.0
@@ -245,9 +260,11 @@ def _linkage_blocks(
                 if two:
                     for j in range(WIDE):
                         theta_b = linkage_lanes.ring_angle(
-                            b.c_b[j], b.d_b[j], b.ax[k, j], b.ay[k, j], b.lb[k, j], b.span[k, j], b.half[k, j]
+                            b.c_b[j], b.d_b[j], b.ax[k, j], b.ay[k, j], b.lb[k, j], b.span_b[k, j], b.half_b[k, j]
                         )
-                        b.theta[k, j], b.twist[k, j] = unison.shared(b.theta[k, j], theta_b, b.shift[j])
+                        b.theta[k, j], b.twist[k, j] = unison.shared(
+                            b.theta[k, j], theta_b, b.shift[j], b.give_a[j], b.give_b[j]
+                        )
                 if eccentric:
                     for j in range(WIDE):
                         b.theta[k, j] = stem.drive(_stem(b, k, j), b.theta[k, j], n_r[m], t_oil[m], t[m], True)

@@ -70,7 +70,7 @@ def clearance_study(
     """
     fits.check()
     if ring is None:
-        ring = clearance_for(geometry, stage, width, replace(fits, ring=0.0), "ring", vane)
+        ring = clearance_for(geometry, stage, width, fits, "ring", vane)
     whole = replace(fits, ring=ring)
     stroke = np.linspace(0.0, 48.0, 49)
     extension, retraction = clearance_loop(geometry, stage, stroke, whole, vane)

@@ -676,8 +676,8 @@ def extended(chain: Chain, wanted: Sequence[str], before: Model, log: str) -> Ex
     of_sides = [f"{side}.{name}" for side, of in before.sides.items() for name in of.effects]
     for name in (x for asked in dict.fromkeys([*before.effects, *of_sides, *wanted]) for x in _forms(asked, chain)):
         law, effect = laws.get(name), side_of(name)[1]
-        if law is None and (kind := chain.plant.kind) not in EFFECTS[effect].kinds:
-            raise InputError(f"--effect {name}: not of an actuator of kind {kind} (docs/effects.md)")
+        if law is None and (why := chain.plant.lacks(EFFECTS[effect])):
+            raise InputError(f"--effect {name}: {why} (docs/effects.md)")
         shown = PLACES[f"{law.at} {law.how}"].stages if law else _shown_by(name, chain)
         places[name] = [s for s in shown if any(s == c.name for c in chain.stages)]
         if not places[name] and (law or name in wanted):

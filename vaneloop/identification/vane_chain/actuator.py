@@ -12,7 +12,7 @@ from plant.effects import piston_stiction
 from plant.parameters import derive
 from plant.places import AERO_LOAD
 from plant.stages import actuator_run, ring_loads, step_currents
-from plant.stages.blocks import NOTHING
+from plant.stages.blocks import NO_RINGS
 from vaneloop.identification.onset import that_begins
 from vaneloop.identification.settings import NEAR_STOP, RASTER, SIMPLER, SUBSTEPS, WINDOW
 from vaneloop.identification.subsystem import Array, Named, Stage, without_jumps
@@ -27,7 +27,7 @@ __all__ = ["actuator_stage"]
 def actuator_stage(driven: Driven) -> Stage:
     """Stroke from the current of every tick, started anew in each window.
 
-    That of one of two actuators feels the rings: their loads follow from both measured strokes (`plant.unison`).
+    That of one of two actuators feels the rings: their loads follow from the other's measured stroke (`plant.unison`).
     """
     t, c, machine, _, outputs, run = driven[:6]
     of = declared_by_side("actuator", driven)
@@ -49,17 +49,17 @@ def actuator_stage(driven: Driven) -> Stage:
 
     def simulate(thetas: Array, current: Array = logged, t_oil: Array = t_oil, p_s: Array = p_s) -> Array:
         each = lanes_by_side(driven, thetas, of)
-        p, pushed = each[side or 0], NOTHING
+        p, rings = each[side or 0], NO_RINGS
         if side is not None:
             p[AERO_LOAD] *= machine.share_of_load
-            pushed = NOTHING if both is None else ring_loads(both, t_oil, dt, each[0], each[1], side)
+            rings = NO_RINGS if both is None else ring_loads(both, t_oil, dt, each[0], each[1], side)
         derive(p, dt / current.shape[1], dt)
         s = np.zeros((chain.N_STATE, len(thetas)))
         s[places.X] = s[places.X_LVDT] = x[0]
         out = np.empty((len(thetas), 1, len(t)))
         known = driven.slipping(signals, p)
         actuator_run(current, n_r, p_s, t_oil, dt, p, s, out[:, 0].T, x, int(round(WINDOW / dt)), known,
-                     pushed)  # fmt: skip
+                     rings)  # fmt: skip
         out *= 1e3
         return out
 

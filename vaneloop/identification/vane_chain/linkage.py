@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from plant.model import side_of
@@ -10,7 +12,7 @@ from plant.places import X
 from plant.stages import linkage_run
 from plant.stages.linkage import speed_reach
 from vaneloop.identification.onset import that_begins
-from vaneloop.identification.settings import SETTLE, WINDOW
+from vaneloop.identification.settings import NOISE_DRAWS, RASTER, SETTLE, WINDOW
 from vaneloop.identification.subsystem import Array, Named, Stage
 from vaneloop.identification.vane_chain.parameters import declared_by_side, lanes_by_side, like_temperature, like_time
 from vaneloop.identification.vane_chain.resample import expect_draws, pieces_of, since
@@ -36,17 +38,30 @@ def linkage_stage(driven: Driven) -> Stage:
     begun = [o in c and bool(driven.sampled(o)[: round(WINDOW / dt)].any()) for o in machine.vanes]
     first = [np.deg2rad(np.median(c[o][:5])) if b else np.nan for o, b in zip(machine.vanes, begun, strict=True)]
 
-    def simulate(thetas: Array, t: Array = t, t_oil: Array = t_oil, off: Array | None = None) -> Array:
+    slow = dt > 1.5 * RASTER  # the stroke reverses between two rows, and the play remembers where
+    step = 0.5 * dt if slow else dt
+
+    def halved(values: Array) -> Array:
+        return _with_midpoints(values) if slow else values
+
+    def driving(off: Array | float, share: Array | float) -> list[Array]:
+        return [_with_reversals(one + off, share) if slow else one + off for one in (x, *x_b)]
+
+    as_logged, speed = driving(0.0, 0.5), halved(n_r)
+
+    def simulate(thetas: Array, t: Array = t, t_oil: Array = t_oil, moved: Sequence[Array] = as_logged) -> Array:
         p, *p_b = lanes_by_side(driven, thetas, of)
-        derive(p, dt, dt)
-        own, *other = (x, *x_b) if off is None else (one + off for one in (x, *x_b))
+        derive(p, step, step)
+        own, *other = moved
+        curves = halved(driven.slipping(signals, p))
         start = machine.start(stroke=own[0], n_r=n_r[0])
         for side, one in enumerate(other, 1):
             start[X, side] = one[0]
         machine.place_rings(start, tuple(first))
         s = np.repeat(start[:, :1], len(thetas), axis=1)
-        out = np.empty((len(thetas), len(first), len(t)))
-        linkage_run(own, n_r, t_oil, t, dt, p, s, out.transpose(2, 1, 0), driven.slipping(signals, p), *other, *p_b)
+        out = np.empty((len(thetas), len(first), len(own)))
+        linkage_run(own, speed, halved(t_oil), halved(t), step, p, s, out.transpose(2, 1, 0), curves, *other, *p_b)
+        out = out[..., ::2] if slow else out
         out = out if which == list(range(len(first))) else out[:, which]
         out = driven.passed.of_rows(np.rad2deg(out, out=out), dt)
         return out if late is None else _earlier(out, late / dt)
@@ -83,13 +98,41 @@ def linkage_stage(driven: Driven) -> Stage:
                 keep[piece[-last:]] = False
         return keep
 
-    if STROKE_OFF in c and not driven.again:
+    if (slow or STROKE_OFF in c) and not driven.again:
         neutral = stage.neutral()[None]
-        as_logged = simulate(neutral)[0]
-        expect_draws(stage, np.array([simulate(neutral, off=1e-3 * off)[0] - as_logged for off in c[STROKE_OFF].T]))
+        digits = 1e-3 * c[STROKE_OFF].T if STROKE_OFF in c else np.zeros((NOISE_DRAWS, 1))
+        shares = [np.random.default_rng(k).random(len(t) - 1) for k in range(len(digits))]
+        drawn = [simulate(neutral, moved=driving(*one))[0] for one in zip(digits, shares, strict=True)]
+        expect_draws(stage, np.array(drawn) - simulate(neutral)[0])
     stage.counted = kept
     stage.excerpt, stage.made = excerpts(linkage_stage, driven, stage, kept), Made(linkage_stage, driven)
     return stage
+
+
+def _with_midpoints(values: Array) -> Array:
+    """Values with one half way between any two: float64[..., 2 samples - 1] of float64[..., samples]."""
+    out = np.empty((*values.shape[:-1], max(2 * values.shape[-1] - 1, 0)))
+    out[..., ::2] = values
+    out[..., 1::2] = 0.5 * (values[..., :-1] + values[..., 1:])
+    return out
+
+
+def _with_reversals(x: Array, share: Array | float) -> Array:
+    """A stroke with a value between any two rows: half way, or its peak where it reverses there.
+
+    The peak lies between the farther of the two rows and the point where the line through the two rows before meets
+    that through the two rows after: at a ``share`` of that way, one number or float64[rows - 1]. A corner has 1, a
+    parabola up to 1/4; between slow rows any share is taken to be equally likely.
+    """
+    out = _with_midpoints(x)
+    first, second = x[1:-2], x[2:-1]
+    rise, fall = first - x[:-3], x[3:] - second
+    reverses = rise * fall < 0.0
+    at = (second - fall - first) / np.where(reverses, rise - fall, 1.0)  # rows behind the first
+    farther = np.where(rise > 0.0, np.maximum(first, second), np.minimum(first, second))
+    peak = farther + np.broadcast_to(share, len(x) - 1)[1:-1] * (first + rise * at - farther)
+    out[3:-2:2] = np.where(reverses & (at > 0.0) & (at < 1.0), peak, out[3:-2:2])
+    return out
 
 
 def _earlier(values: Array, rows: Array) -> Array:

@@ -78,9 +78,9 @@ def declared(stage: str, driven: Driven) -> tuple[tuple[Parameter, ...], tuple[E
 def declared_by_side(stage: str, driven: Driven) -> Declared:
     """Parameters and effects of a stage.
 
-    Of two actuators those of valve, actuator and LVDT are a side's, named as in a model file: ``side_a.lvdt_bias``. The
-    actuator of a side has its own, and the LVDT of the other, whose reading drives it through the rings. Where both
-    strokes drive a stage it has either LVDT's, and what both have alike.
+    Of two actuators those of valve, actuator, LVDT and link are a side's, named as in a model file:
+    ``side_a.lvdt_bias``. The actuator of a side has its own, and LVDT and link of the other, which drive it through the
+    rings. Where both strokes drive a stage it has either LVDT's and link's, and what both have alike.
     """
     machine = driven.machine
     known = {n.name: n for n in machine.nominal}
@@ -107,7 +107,7 @@ def declared_by_side(stage: str, driven: Driven) -> Declared:
         sides.append(side)
     effects = []
     for e in EFFECTS.values():
-        if stage not in e.stages or machine.kind not in e.kinds:
+        if stage not in e.stages or not machine.can_have(e):
             continue
         own = machine.parameters_of(e.name)
         ps = tuple(
@@ -145,6 +145,8 @@ def sides_of(e: PlantEffect, driven: Driven) -> tuple[int, ...]:
     machine = driven.machine
     if machine.sides == 1 or not of_a_side(e.name, machine.one_valve):
         return (BOTH,)
+    if e.site == "link":  # of both it is a fault of the linkage, or of the stiffness of the rings
+        return (0, 1) if driven.both is not None else ()
     if driven.side is None:
         return (BOTH, 0, 1) if driven.both is not None else (BOTH,)
     return (driven.side, 1 - driven.side) if e.site == "lvdt" and driven.both is not None else (driven.side,)

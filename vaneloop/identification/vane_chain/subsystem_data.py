@@ -25,10 +25,11 @@ from vaneloop.identification.user_models.motion import smoothed
 from vaneloop.identification.user_models.simulation import Placed
 from vaneloop.identification.vane_chain.low_pass import AS_LOGGED, LowPass
 
-__all__ = ["SAMPLED_OF", "STROKE_OFF", "VANES_LATE", "Driven", "Made", "excerpts", "stroke_of"]
+__all__ = ["ALSO", "SAMPLED_OF", "STROKE_OFF", "VANES_LATE", "Driven", "Made", "excerpts", "stroke_of"]
 
 SAMPLED_OF = "sampled "  # and an output's name: a column that is 1 where the output was sampled; without it, everywhere
 STROKE_OFF = "stroke off"  # a column, float64[rows, draws]: mm, what the last digit of the stroke may be off by
+ALSO = MappingProxyType({"x_lvdt": ("stroke",), "i_cmd": ("ticks", "other_ticks")})  # columns that hold the same
 VANES_LATE = "vanes late"  # a column: s, by which each row of the vane angles stands late; without it, 0
 
 

@@ -1,6 +1,6 @@
 """The page on the library of effects, made from the effects' own docstrings and declarations.
 
-``python -m plant.effects_page > docs/effects.md`` writes it anew; a test says when that is due.
+``python -m benchmarks.effects_page > docs/effects.md`` writes it anew; a test says when that is due.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ HEAD = """# Effects
 Physics that the nominal machine does not have. Each is one file in `plant/effects/`, neutral by default: at its neutral
 values the machine is the nominal one, bit for bit. A model file (`plant/model.py`) switches effects on; `vaneloop
 diagnose` looks for them in a log. A parameter `vigv`, `vgv1`, ... is one of each vane row that the machine has. The
-column "actuator" names the kind of actuator that an effect belongs to ([machines](machines.md)).
+column "actuator" names the kind of actuator that an effect belongs to ([machines](machines.md)); what is of "two
+hydraulic" is of one side of [two actuators](machines.md#two-actuators).
 
-This page is made from the files: `python -m plant.effects_page > docs/effects.md`. Units are those of the borders
+This page is made from the files: `python -m benchmarks.effects_page > docs/effects.md`. Units are those of the borders
 (docs/architecture.md); inside the code everything is SI.
 
 | effect | site | actuator | shows in | what |
