@@ -5,11 +5,15 @@ written to docs/settings.md.
 from __future__ import annotations
 
 import argparse
-from itertools import groupby
+import ast
+import re
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from pathlib import Path
 
 from benchmarks.measure import ROOT
 from vaneloop.base.files import write
-from vaneloop.identification.settings import RECORD
+from vaneloop.identification import settings
 
 PAGE = ROOT / "docs" / "settings.md"
 BEGINNING = """# Thresholds of the identification
@@ -24,13 +28,43 @@ decides. The unit 1 is a pure number. A unit in the plural counts or multiplies 
 """
 
 
+@dataclass(frozen=True)
+class Setting:
+    """One threshold: its name, the heading it stands under, its value, unit, meaning and origin."""
+
+    name: str
+    heading: str
+    value: object
+    unit: str
+    meaning: str
+    origin: str
+
+
+def record() -> list[Setting]:
+    """All thresholds, in the order of their file. ValueError where the text below a value is not as the file says."""
+    source = Path(settings.__file__).read_text(encoding="utf-8")
+    headings = {n: m[1] for n, line in enumerate(source.splitlines(), 1) if (m := re.match(r"# -+ (.+?) -+$", line))}
+    found = []
+    for value, text in pairwise(ast.parse(source).body):
+        if not isinstance(value, ast.Assign):
+            continue
+        name = ast.unparse(value.targets[0])
+        said = ast.literal_eval(text.value) if isinstance(text, ast.Expr) else ""
+        parts = re.fullmatch(r"(.+?): (.+?\.) (.+)", " ".join(said.split()))
+        if parts is None:
+            raise ValueError(f"{name}: below it stands no `unit: Meaning. origin`")
+        heading = headings[max(n for n in headings if n < value.lineno)]
+        found.append(Setting(name, heading, getattr(settings, name), *parts.groups()))
+    return found
+
+
 def page() -> str:
     """docs/settings.md: a table for each heading, of two rows for each threshold."""
     parts = [BEGINNING]
-    for heading, rows in groupby(RECORD.items(), lambda row: row[1].heading):
+    for heading, rows in groupby(record(), lambda row: row.heading):
         parts.append(f"\n## {heading}\n\n| threshold | value, unit | meaning, origin |\n|---|---|---|\n")
-        for name, s in rows:
-            parts.append(f"| `{name}` | {shown(s.value)} | {s.meaning} |\n| | {s.unit} | {s.origin} |\n")
+        for s in rows:
+            parts.append(f"| `{s.name}` | {shown(s.value)} | {s.meaning} |\n| | {s.unit} | {s.origin} |\n")
     return "".join(parts)
 
 

@@ -10,7 +10,9 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
-from benchmarks.settings import PAGE, page
+import pytest
+
+from benchmarks.settings import PAGE, page, record
 from tests.conftest import ROOT
 from tests.syntax import nodes
 from vaneloop.identification import settings
@@ -81,22 +83,26 @@ def test_no_threshold_stands_outside_the_record() -> None:
 
 
 def test_every_name_stands_once_with_unit_meaning_and_origin() -> None:
-    tree = ast.parse(Path(settings.__file__).read_text())
-    named = [
-        s.targets[0].id
-        for s in tree.body
-        if isinstance(s, ast.Assign) and isinstance(s.targets[0], ast.Name) and isinstance(s.value, ast.Call)
-        if ast.unparse(s.value.func) == "setting"
-    ]
-    assert [n for n, times in Counter(named).items() if times > 1] == []
-    assert list(settings.RECORD) == named
-    for name, s in settings.RECORD.items():
-        assert getattr(settings, name) is s.value, name
-        assert s.unit and s.heading, name
-        assert re.fullmatch(r"[A-Z].{15,}\.", s.meaning) and ". " not in s.meaning, (name, s.meaning)
+    found = record()
+    assert [n for n, times in Counter(s.name for s in found).items() if times > 1] == []
+    assert {s.name for s in found} == {n for n in vars(settings) if n.isidentifier() and not n.startswith("_")}
+    for s in found:
+        assert s.name.isupper() and s.heading, s.name
+        assert re.fullmatch(r"[A-Z].{15,}\.", s.meaning) and ". " not in s.meaning, (s.name, s.meaning)
         kind, _, reason = s.origin.partition(": ")
-        assert kind in KINDS and len(reason) > 3, (name, s.origin)
-        assert "|" not in s.unit + s.meaning + s.origin, name
+        assert kind in KINDS and len(reason) > 3, (s.name, s.origin)
+        assert "|" not in s.unit + s.meaning + s.origin, s.name
+
+
+@pytest.mark.parametrize("below", ["", '"""mm. It ends here. numerics: 2 bits"""', '"""mm: It ends here"""'])
+def test_a_threshold_of_which_nothing_is_said_is_named(
+    below: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "settings.py"
+    file.write_text(f"# ---- Ends ----\nLIMIT = 4.0\n{below}\nLAST = 1.0\n")
+    monkeypatch.setattr(settings, "__file__", str(file))
+    with pytest.raises(ValueError, match="LIMIT"):
+        record()
 
 
 def test_every_threshold_decides_something() -> None:
@@ -110,14 +116,12 @@ def test_every_threshold_decides_something() -> None:
         if isinstance(n, ast.ImportFrom) and n.module == settings.__name__
         for a in n.names
     }
-    assert set(settings.RECORD) - own == imported - own and imported <= read
+    assert {s.name for s in record()} - own == imported - own and imported <= read
 
 
 def test_the_record_depends_on_nothing_of_the_program() -> None:
     tree = ast.parse(Path(settings.__file__).read_text())
-    assert {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)} == {
-        "__future__", "dataclasses", "typing",
-    }  # fmt: skip
+    assert not [n for n in ast.walk(tree) if isinstance(n, ast.Import | ast.ImportFrom)]
 
 
 def test_the_page_is_up_to_date() -> None:
