@@ -110,7 +110,7 @@ NOT_RUN: dict[str, str] = {
     "vaneloop map --check bench.blf": "a log and a DBC of the reader's own; tests/test_corpus.py",
     "vaneloop replay rig.mf4": "a file with several groups of one channel name; tests/test_logs.py writes one",
     "vaneloop extend warm_play.parquet --effect play_temperature": "after the page's change to the library",
-    "python -m plant.effects_page": "overwrites docs/effects.md; tests/test_effects.py compares it",
+    "python -m benchmarks.effects_page": "overwrites docs/effects.md; tests/test_effects.py compares it",
     "python -m tests.costs": "reads what the runs of the whole left; tests/test_costs.py",
     "python -m tests.rig.ladder": "some 40 effects in five sizes take an hour",
     "python -m benchmarks": "measures for minutes; no test judges time",

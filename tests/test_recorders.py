@@ -118,6 +118,26 @@ def test_zeros_of_a_recorder_are_set_right(stroke: float, speed: float):
     assert compare_stages(build_chain(file, late=chain.late).stages) == compare_stages(chain.stages)
 
 
+def test_zeros_are_found_behind_clocks_that_differ():
+    log, high, late = rows(SEED), {"x_lvdt": 0.02, "n_r": 0.03}, {"x_dem": 0.02, "n_dem": 0.02}
+    names = [name for name in log if name != "t"]
+    channels = {k: Channel(log["t"] + late.get(k, 0.0), log[k] + high.get(k, 0.0)) for k in names}
+    chain = build_chain(Log("both", channels, []))
+    assert {one.channels[0]: one.zero for one in chain.late["linkage"]} == pytest.approx(high, rel=0.1)
+    assert any("x_dem: stand 20 ms late" in n for n in chain.notes)
+    assert all(s.agrees for s in compare_stages(chain.stages))
+
+
+@pytest.mark.parametrize(("current", "told"), [(0.06, True), (-0.06, True), (2.0, False)])
+def test_a_zero_of_the_current_is_the_recorder_s_where_the_stroke_has_one_as_large(current: float, told: bool):
+    log, high = rows(SEED), {"x_lvdt": 0.02, "i_cmd": current}
+    channels = {k: Channel(log["t"], v + high.get(k, 0.0)) for k, v in log.items() if k != "t"}
+    chain = build_chain(Log("zeros", channels, []))
+    found = {one.channels[0]: one.zero for one in chain.late["actuator"]}
+    assert found == pytest.approx(high if told else {"x_lvdt": 0.02}, rel=0.1)
+    assert compare_stages([chain.stage("actuator")])[0].agrees == told
+
+
 @pytest.mark.parametrize(
     "hidden",
     [("schedule_error", {"offset": 2e-4}), ("lvdt_bias", {"bias": 3e-4}), ("controller_gain_error", {"factor": 1.1})],
@@ -281,6 +301,9 @@ def test_what_a_last_digit_hides_is_one_error_as_long_as_it_stands():
         Logger(1000, resolution=1.0, hum=(50.0, 0.5), offset={"bus": 0.0029}),
         Logger(100, hum=(400.0, 0.5)),  # which stands still in these rows: the zeros of all channels
         Logger(200, hum=(400.0, 0.5), window=0.005, drift=3e-5),
+        Logger(20, colour=(0.07, 1.0), drift=-1.3e-5, stale=(0.0002, 11)),
+        Logger(25, filter=(2, 10.5), colour=(0.2, 0.5), stale=(0.0, 13)),
+        Logger(200, hum=(400.0, 2.0), offset={"bus": -0.0185, "controller": 0.0174}, stale=(0.0002, 25)),
     ],
 )
 def test_no_subsystem_of_a_clean_log_fails_whatever_its_recorder_rounds_and_repeats(logger: Logger, tmp_path: Path):

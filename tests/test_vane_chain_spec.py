@@ -22,6 +22,7 @@ from plant.curve import KNOWN, PLACES, QUANTITIES
 from plant.effects import EFFECTS
 from plant.model import Learned
 from plant.stages.linkage import speed_reach
+from tests.small_logs import log_of, white
 from vaneloop.base.errors import InputError
 from vaneloop.base.vanes import VANES
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
@@ -120,19 +121,6 @@ CALIBRATION = load_calibration()
 LATE, TICK = 0.04, 1e-3  # s
 VANES_SET = set(VANES)
 NATS, RIVAL_SPREADS = 12.0, 0.3  # docs/settings.md
-
-
-def white(seed: int, *shape: int) -> Array:
-    return np.random.default_rng(seed).standard_normal(shape)
-
-
-def log_of(t: Array | None = None, **channels: Any) -> Log:
-    """A log of channels, each its values on ``t``, or (times, values)."""
-    made = {}
-    for name, v in channels.items():
-        times, values = v if isinstance(v, tuple) else (t, v)
-        made[name] = Channel(np.asarray(times, dtype=float), np.asarray(values, dtype=float))
-    return Log("a.csv", made)
 
 
 # ---- raster and rows -------------------------------------------------------------------------------------------------
@@ -369,9 +357,38 @@ def test_the_current_of_every_tick_has_the_logged_mean() -> None:
     bridged = [between_rows(c, law, 0.0, run, CALIBRATION, None, seed)[120:125] for seed in (0, 1)]
     assert bridged[0] == pytest.approx(law[120:125] + 4.0, abs=1e-9) and np.all(bridged[1] == 8.0)
     c["missing"][:], c["i_cmd"][120:125] = 0.0, law[120:125].mean(axis=1) + 4.0
-    unknown = np.full(300, 2.0)
-    assert between_rows(c, law, 0.0, run, CALIBRATION, unknown, 0).mean(axis=1) == pytest.approx(c["i_cmd"])
-    assert between_rows(c, law, 0.0, run, CALIBRATION, unknown, 1).mean(axis=1) == pytest.approx(c["i_cmd"] + 2.0)
+    errors = np.full((300, 2), 3.0), np.full((300, 2), 1.0)
+    assert between_rows(c, law, 0.0, run, CALIBRATION, errors, 0).mean(axis=1) == pytest.approx(c["i_cmd"])
+    assert between_rows(c, law, 0.0, run, CALIBRATION, errors, 1).mean(axis=1) == pytest.approx(c["i_cmd"] + 2.0)
+
+
+@pytest.mark.parametrize("recorders", [0.0, 0.01, 0.2])
+@pytest.mark.parametrize("known", [0.0, 0.1])
+def test_samples_that_obey_the_law_leave_only_the_noise_of_the_others_unknown(recorders: float, known: float) -> None:
+    """What logged samples are off the law beyond its own errors, which the draws hold, is the recorder's."""
+    law = np.cumsum(white(5, 4000, 10).ravel()).reshape(4000, 10) * 0.1
+    logged = law.mean(axis=1) + recorders * white(6, 4000) + known * white(8, 4000)
+    c = {"i_cmd": logged, "missing": np.zeros(4000), "fresh": np.ones(4000)}
+    of_some = known * white(9, 4000, 3)
+    errors = of_some + 0.05 * white(7, 4000, 3), of_some
+    first, other = (
+        between_rows(c, law, 0.3, np.ones(4000, dtype=bool), CALIBRATION, errors, seed).mean(axis=1) for seed in (0, 1)
+    )
+    most = 0.4 * known  # the power of 4,000 rows is known to some per cent
+    assert np.hypot(0.05, recorders) * 0.95 < np.std(other - first) < np.hypot(np.hypot(0.05, recorders) * 1.05, most)
+
+
+def test_a_gap_parts_the_integral_s_constants() -> None:
+    """Behind a gap and the rows that settle there the integral has another constant; each side keeps its own."""
+    law, run = np.cumsum(white(5, 600, 10).ravel()).reshape(600, 10) * 0.1, np.ones(600, dtype=bool)
+    run[280:340] = False
+    c = {"i_cmd": law.mean(axis=1) + 4.0, "missing": np.zeros(600), "fresh": np.where(run, 1.0, 0.0)}
+    before = between_rows(c, law, 0.0, run, CALIBRATION, None, 0)
+    law[280:310] += np.arange(30.0)[:, None] * 50.0  # what the law makes of a gap says nothing
+    law[310:] -= 7000.0
+    after = between_rows(c, law, 0.0, run, CALIBRATION, None, 0)
+    assert after[run] == pytest.approx(before[run], abs=1e-6)
+    assert after[run, -1] == pytest.approx(law[run, -1] + np.where(np.arange(600) < 300, 4.0, 7004.0)[run], abs=1e-6)
 
 
 @pytest.mark.parametrize("rows", [9, 15])
@@ -553,7 +570,7 @@ def test_a_curve_is_a_candidate_where_no_plainer_one_says_the_same(
 
 
 def test_the_profiles_of_the_bank_are_safe_demands() -> None:
-    bank = experiment.profiles()
+    bank = experiment.profiles.__wrapped__()
     assert len(bank) == 8
     for name, profile in bank.items():
         assert profile.min() >= 45.0 and profile.max() <= 100.0 and 5000 <= len(profile) <= 13000, name

@@ -368,8 +368,9 @@ def _in_place_of(stage: Stage, other: StageDiagnosis, effect: str) -> tuple[str,
 
 
 def _join(stages: dict[str, Stage], results: Sequence[StageDiagnosis]) -> None:
-    """Give one name to what stages say of a family: where members are each other's rivals, that of the stage where it
-    gains most; where each stage names its own and their sizes agree, the family's, for each place has it.
+    """Give one name to what stages say of a family: where members are each other's rivals, that of a stage that tells
+    them apart, of several that of the one where it gains most; where each stage names its own and their sizes agree,
+    the family's, for each place has it.
     """
     families: dict[str, list[tuple[StageDiagnosis, int]]] = {}
     for d in results:
@@ -377,7 +378,9 @@ def _join(stages: dict[str, Stage], results: Sequence[StageDiagnosis]) -> None:
             if family := stages[d.stage].effect(f.effect).family:
                 families.setdefault(family, []).append((d, k))
     for family, members in families.items():
-        lead = max((d.effects[k] for d, k in members), key=lambda f: f.nats).effect
+        own = {m for d, k in members for m in (d.effects[k].effect, *d.effects[k].rivals)
+               if stages[d.stage].effect(m).family == family}  # fmt: skip
+        lead = max((d.effects[k] for d, k in members), key=lambda f: (own.isdisjoint(f.rivals), f.nats)).effect
         for d, k in members:
             f = d.effects[k]
             if lead in f.rivals and lead in f.fits:

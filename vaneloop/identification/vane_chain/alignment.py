@@ -42,7 +42,7 @@ from vaneloop.identification.subsystem import Array, Stage
 from vaneloop.identification.vane_chain.current import LOGGED_CURRENT, law_of, taken
 from vaneloop.identification.vane_chain.low_pass import AS_LOGGED, LOW_PASSES, LowPass
 from vaneloop.identification.vane_chain.resample import OF_SUBSYSTEM, Grid, first_row, last_digit
-from vaneloop.identification.vane_chain.subsystem_data import VANES_LATE, Made
+from vaneloop.identification.vane_chain.subsystem_data import ALSO, VANES_LATE, Made
 
 __all__ = [
     "Late", "LateIn", "aligned", "demand_of", "driving", "explains", "fits", "late_in_controller", "late_vanes",
@@ -173,14 +173,23 @@ def late_in_controller(stages: Sequence[Stage]) -> LateIn:
 
 
 def zeros_in_controller(stages: Sequence[Stage]) -> LateIn:
-    """Strokes and rotor speeds that read higher in the file than in the controller, where the stages of a log fail."""
+    """Strokes and rotor speeds that read higher in the file than in the controller, where the stages of a log fail; and
+    beside them the current, by no more of its noise floors: alone it would be the valve's null.
+    """
     of = _judged(stages)
     speed = next((name for name in ("demand", "engine") if name in of), "")
-    zeros = []
+    zeros: dict[str, float] = {}
     for name, channel in (("servo", "x_lvdt"), (speed, "n_r")):
         if name in of and not fits(of[name]) and (zero := _zero(of[name], channel)):
-            zeros.append(Late((channel,), 0.0, zero=zero))
-    return dict.fromkeys(OF_SUBSYSTEM, tuple(zeros)) if zeros else {}
+            zeros[channel] = zero
+    floors = {c: float(f) for one in of.values() for c, f in zip(one.outputs, np.asarray(one.floor), strict=True)}
+    most = max((abs(zero) / floors[c] for c, zero in zeros.items() if c in floors), default=0.0)
+    if most and "i_cmd" in floors and "actuator" in of and not fits(of["actuator"]):
+        zero = _zero(of["actuator"], "i_cmd")
+        if 0.0 < abs(zero) <= most * floors["i_cmd"]:
+            zeros["i_cmd"] = zero
+    late = tuple(Late((c,), 0.0, zero=zero) for c, zero in zeros.items())
+    return dict.fromkeys(OF_SUBSYSTEM, late) if late else {}
 
 
 def _zero(stage: Stage, channel: str) -> float:
@@ -191,9 +200,11 @@ def _zero(stage: Stage, channel: str) -> float:
 
     def fitted(column: str, rise: Array) -> tuple[Array, Array, Array]:
         """`_fit` of an offset, each unit of which adds ``rise`` to a column of the stage."""
+        columns = [c for c in (column, *ALSO.get(column, ())) if c in driven.columns]
 
         def without(zero: Array) -> dict[str, Array]:
-            return {column: driven.columns[column] - zero[0] * rise}
+            of = {c: driven.columns[c] for c in columns}
+            return {c: x - zero[0] * (rise if rise.ndim == x.ndim else rise[:, None]) for c, x in of.items()}
 
         return _fit(stage, _moving(stage, without), 1, most=np.inf)
 

@@ -174,8 +174,16 @@ def build_chain(
     chain = _build(log, plant, calibration, present, grid, pieces, draws, known)
     known_clocks = late is not None or framed or chain.plant.sides > 1
     noisy = expect_stationary_noise(chain.stages) if known_clocks else []
-    for find in () if known_clocks else (zeros_in_controller, late_in_controller, late_vanes):
+    steps, once_more = [] if known_clocks else [zeros_in_controller, late_in_controller, late_vanes], True
+    while steps:
+        find = steps.pop(0)
         found = find(chain.stages)
+        if found and find is late_in_controller and once_more:  # clocks may have hidden a zero
+            once_more = False
+            steps.insert(0, zeros_in_controller)
+        if found and find is zeros_in_controller and known:  # and were then read off channels with a wrong one
+            known = {name: tuple(one for one in all_of if one.zero) for name, all_of in known.items()}
+            steps.insert(0, late_in_controller)
         if found:
             known = {**known, **{name: known.get(name, ()) + more for name, more in found.items()}}
             hidden = {s.name: s.raster_error for s in chain.stages}
@@ -311,7 +319,8 @@ def _cut(log: Log, grid: Grid, stages: Mapping[str, OfSubsystem]) -> list[str]:
             if abs(grid.start + rows[k] * grid.dt - edges[k]) > 1.5 * WINDOW:
                 at = [c for c in (*drives, *of.gives) if c in many and grid.rows_of(c)[k] == rows[k]]
                 last = min(at, key=lambda c: (c not in drives, many[c].t[-1] if k else -many[c].t[0]))
-                lost = round(abs(grid.start + rows[k] * grid.dt - edges[k]) / grid.dt)
+                # of the rows behind the last, the first is lost, too
+                lost = round(abs(grid.start + rows[k] * grid.dt - edges[k]) / grid.dt) + k
                 said.setdefault((f"{last} {words} {many[last].t[-k]:.5g} s", side, lost), []).append(name)
         for c in of.gives:
             if c in many and (grid.rows_of(c)[0] > rows[0] or grid.rows_of(c)[1] < rows[1]):
@@ -419,10 +428,10 @@ def _chain(
                 law, *off = servo_law(t, have, cal, smooth, grid.digits, draws, samples, behind)
             sampled = what == SAMPLED
             have["law"], have["law_error"] = law, off[1] if sampled else off[0]
-            unknown = off[0][:, 0] - off[1][:, 0] if sampled else None
+            errors = (off[0], off[1]) if sampled else None
             size = cal.scalars.kp * smooth.noise
             have["ticks"], have["other_ticks"] = (
-                between_rows(have, law, size, both.run, cal, unknown, seed) for seed in (0, 1)
+                between_rows(have, law, size, both.run, cal, errors, seed) for seed in (0, 1)
             )
         have["stroke"] = smooth.stroke
     smooth_of = {}

@@ -152,7 +152,13 @@ def _between(x: Array, slope: Array, out: Array) -> None:
 
 
 def between_rows(
-    c: dict[str, Array], law: Array, size: float, run: Array, cal: Calibration, unknown: Array | None, seed: int
+    c: dict[str, Array],
+    law: Array,
+    size: float,
+    run: Array,
+    cal: Calibration,
+    errors: tuple[Array, Array] | None,
+    seed: int,
 ) -> Array:
     """Current (mA) of every tick, float64[rows, 10], whose mean over a row is the logged one.
 
@@ -161,26 +167,31 @@ def between_rows(
     Where the law does not hold (not in mode RUN, at the current's limit) the current is the row's mean; where samples
     of the row are missing, it is the law's.
 
-    law      of `servo_law`
-    size     mA, RMS of the LVDT's noise in the current
-    unknown  mA, such an error as the law left in each row's mean, where that was worked out from its last tick; with
-             the noise of about one tick it is added for any ``seed`` but 0
+    law     of `servo_law`
+    size    mA, RMS of the LVDT's noise in the current
+    errors  mA, draws of the law's errors in a row's mean and in its logged samples, of `servo_law`, where the mean was
+            worked out from samples. The mean is then off by the one error less the other and by the recorder's noise:
+            as much as the samples are off the law from row to row beyond its errors. Any ``seed`` but 0 adds both
     """
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal(law.shape)
     noise[:, -1] = 0.0
     known = _known(c)
-    slow = scipy.ndimage.uniform_filter1d(  # the integral's constant
-        _bridged(c["i_cmd"] - law.mean(axis=1), known), SMOOTH_ROWS[-1]
-    )
+    alone = ~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.scalars.current_limit)
+    held = known & ~alone
+    off = c["i_cmd"] - law.mean(axis=1)
+    slow = _mean_of(off, held, SMOOTH_ROWS[-1])  # the integral's constant, another one behind each gap
     ticks = law + slow[:, None] + size * noise
     # the row's own tick is known; the others' noise was such that the mean comes out
     more = np.where(known, c["i_cmd"] - ticks.mean(axis=1), 0.0)
     ticks[:, :-1] += more[:, None] * (law.shape[1] / (law.shape[1] - 1.0))
-    alone = ~run | (np.abs(c["i_cmd"]) > 0.9e3 * cal.scalars.current_limit)
     ticks[alone] = c["i_cmd"][alone, None]
-    if unknown is not None and seed:
-        ticks += (unknown + size * rng.standard_normal(len(law)))[:, None]
+    if errors is not None and seed:
+        of_mean, of_some = errors
+        both = held[1:] & held[:-1]  # from row to row: what changes slowly is the stroke's, and cancels in the mean
+        power = 0.5 * (_power(np.diff(off)[both]) - _power(np.diff(of_some, axis=0)[both]))
+        recorders = np.sqrt(max(power, 0.0)) * rng.standard_normal(len(law))
+        ticks += (of_mean[:, 0] - of_some[:, 0] + recorders)[:, None]
     if seed:  # where samples are missing, straight lines are as likely
         ticks[~known] = c["i_cmd"][~known, None]
     return np.asarray(ticks)
@@ -339,6 +350,18 @@ def without_noise(t: Array, c: dict[str, Array], machine: Plant, known: Array = 
 def _known(c: Mapping[str, Array]) -> Array:
     """Rows that have their samples, and those in a gap, which count nowhere: bool[rows]."""
     return np.asarray((c["missing"] == 0.0) | (c["fresh"] == 0.0))
+
+
+def _power(values: Array) -> float:
+    """Mean square; 0 of no values."""
+    return float(np.mean(values**2)) if values.size else 0.0
+
+
+def _mean_of(values: Array, held: Array, rows: int) -> Array:
+    """Mean of those of ``rows`` around each row that are ``held``, with straight lines where none is."""
+    share = scipy.ndimage.uniform_filter1d(held.astype(float), rows)
+    mean = scipy.ndimage.uniform_filter1d(np.where(held, values, 0.0), rows) / np.maximum(share, 1.0 / rows)
+    return _bridged(mean, share > 0.5 / rows)
 
 
 def _bridged(values: Array, known: Array) -> Array:

@@ -3,15 +3,18 @@
 `hil.figures.noise_floor` sees what changes from row to row, and the coloured noise of a recorder is more than that.
 What tells it from missing physics: it is the same under every condition. An error is taken for noise where
 
-* its mean square in the bins of every condition is what is expected, within half of what exceeds the floor,
+* its mean square in the bins of each condition is what is expected, within `NOISE_ALIKE` of what exceeds the floor and
+  chance: one test for all bins of a condition,
 * no bin has a mean that makes as much of it, or such a slope in the windows whose constant is free,
 * no line of its spectrum does: what swings has a cause,
 * the nominal parameters, beyond their tolerances, would take no more of it than chance allows,
-* but for the one bin in twenty that chance allows; and the bins are known well enough to tell: those of one output,
-  where a subsystem has several, for these have one recorder.
+* and the log is long enough to tell: an error found in only half of a condition's bins would fail that test with a
+  probability of `NOISE_TOLD`, for at least half of the conditions. Outputs of one subsystem have one recorder: one of
+  them has to tell.
 
 Expected is the output's own noise, which is no more than how the output moves where it is quietest, and a share of what
-draws of noise do in a channel that drives the subsystem, which through a table or through play is not alike everywhere.
+draws of noise do in a channel that drives the subsystem, which through a table or through play is not alike everywhere;
+what slow rows hide is expected where they hide it.
 The noise of a channel is how it moves where it is quietest, or what the subsystem that explains it leaves, once that is
 known to be noise. So a valve's dead band, whose error is much the same under every condition, is none: its piston
 rests.
@@ -20,24 +23,28 @@ rests.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
 from vaneloop.identification.regimes import bins_of
 from vaneloop.identification.settings import (
+    AGREES,
     FLOOR_KNOWN,
     NOISE_ALIKE,
     NOISE_BY_CHANCE,
     NOISE_DRAWS,
+    NOISE_TOLD,
     NOISE_WINDOW,
     QUIET_KNOWN_TO,
     WINDOW,
 )
 from vaneloop.identification.subsystem import Array, Stage, noise_of
 from vaneloop.identification.vane_chain.current import law_of
-from vaneloop.identification.vane_chain.subsystem_data import Made
+from vaneloop.identification.vane_chain.subsystem_data import ALSO, Made
 
 __all__ = ["bounded", "expect_stationary_noise", "like"]
 
@@ -46,17 +53,17 @@ ORDER: Mapping[str, str] = {
     "engine": "", "servo": "x_lvdt", "actuator": "i_cmd", "actuator_a": "i_cmd", "actuator_b": "i_cmd", "demand": "n_r",
     "linkage": "x_lvdt",
 }  # fmt: skip
-ALSO = {"x_lvdt": ("stroke",), "i_cmd": ("ticks", "other_ticks")}  # columns that hold the same
 
 
 class Expected(NamedTuple):
-    """The noise of an output: its RMS, the share of the draws' power in it, and whether its bins are known well enough
-    to tell it from physics.
+    """The noise of an output: its RMS, the share of the draws' power in it, whether its bins are known well enough to
+    tell it from physics, and the share of what the rows hide that stands where they hide it.
     """
 
     size: float
     share: float
     told: bool = True
+    hidden: float = 1.0
 
 
 def expect_stationary_noise(stages: Sequence[Stage]) -> list[str]:
@@ -79,12 +86,13 @@ def expect_stationary_noise(stages: Sequence[Stage]) -> list[str]:
             if draws is not None:  # as errors are: without the free constants
                 made = np.mean(judge._whiten(judge.measured - draws) ** 2, axis=0) * judge.floor[:, None] ** 2
             columns = stage.made.driven.columns  # type: ignore[attr-defined]
-            found = [_noise_in(judge, k, e[k], made[k], columns[o]) for k, o in enumerate(stage.outputs)]
+            lost = judge.lost()
+            found = [_noise_in(judge, k, e[k], made[k], columns[o], lost[k]) for k, o in enumerate(stage.outputs)]
             expected = [one for one in found if one is not None]
             told = any(one.told and one.size > seen for one, seen in zip(expected, judge.floor, strict=False))
             if len(expected) < len(found) or not told or np.any(_of_parameters(judge, theta) > NOISE_BY_CHANCE):
                 continue
-            notes.append(_said(stage, expected, judge.floor))
+            notes += _said(stage, expected, judge.floor)
             _expect(stage, expected, draws)
         for k, channel in enumerate(stage.outputs):
             noise[channel] = _windows(stage, np.where(judge.valid[k], e[k], np.nan), stage.window)
@@ -134,19 +142,23 @@ def _draws(stage: Stage, channel: str, windows: Array) -> Array | None:
     return np.array(out)
 
 
-def _noise_in(judge: LeastSquaresProblem, k: int, error: Array, made: Array, output: Array) -> Expected | None:
+def _noise_in(
+    judge: LeastSquaresProblem, k: int, error: Array, made: Array, output: Array, lost: Array
+) -> Expected | None:
     """The noise that the ``error`` of output ``k`` is, float64[samples] in its unit; None: it is none.
 
     made    mean square of what draws of noise in a driving channel make of it, float64[samples]
     output  as it was logged: in its quietest windows there is no less than its noise
+    lost    squared error that the rows make expect in each sample, in squared noise floors, 1 on average
     """
     stage, floor = judge.stage, float(judge.floor[k])
     bins = [b for values in stage.regimes.values() if (b := bins_of(judge, k, values)) is not None]
     if not bins:
         return None
     place = ((stage.t - stage.t[0]) / stage.window) % 1.0 - 0.5 if stage.window else np.ones_like(stage.t)
-    n, square, through, sign = (
-        np.concatenate([b.sums(x) for b in bins]) for x in (np.ones_like(error), error**2, made, error * place)
+    spread = floor**2 * (lost - 1.0)  # what the rows hide, beside its mean
+    n, square, uneven, through, sign = (
+        np.concatenate([b.sums(x) for b in bins]) for x in (np.ones_like(error), error**2, spread, made, error * place)
     )
     count = n.sum(axis=1)
     whole = float(square.sum() / count.sum())
@@ -157,26 +169,59 @@ def _noise_in(judge: LeastSquaresProblem, k: int, error: Array, made: Array, out
         _quietest(_windows(stage, np.where(judge.valid[k], output, np.nan), stage.window))
     )
     weight = 1.0 / (np.sqrt(count) * whole)
-    a = np.array([whole * count, through.sum(axis=1)]).T
-    most = np.array([own_most / whole, QUIET_KNOWN_TO**2])
-    own, share = bounded(a * weight[:, None], square.sum(axis=1) * weight, most) * (whole, 1.0)
+    a = np.array([whole * count, through.sum(axis=1), uneven.sum(axis=1)]).T
+    most = np.array([own_most / whole, QUIET_KNOWN_TO**2, 1.0])
+    own, share, hidden = bounded(a * weight[:, None], square.sum(axis=1) * weight, most) * (whole, 1.0, 1.0)
     excess = 1.0 - floor**2 / whole
-    expected = own * n + share * through
+    expected = own * n + share * through + hidden * uneven
     of = np.maximum(expected, whole * n)  # where little is expected, what is left counts as it does elsewhere
     ratio, deviation = _over_blocks(square - expected + of, of)
     mean, of_mean = _over_blocks(sign, n)
     of_sign = NOISE_ALIKE * excess * whole * float(np.mean(place[judge.valid[k]] ** 2))
-    differs = np.abs(ratio - 1.0) > NOISE_ALIKE * excess + 2.0 * deviation
+    ends = np.cumsum([b.many for b in bins])[:-1]
+    conditions = zip(*(np.split(x, ends) for x in (ratio, deviation, n)), strict=True)
+    tests = [_alike(r, d, m, excess, NOISE_BY_CHANCE / len(bins)) for r, d, m in conditions]
     signed = np.maximum(np.abs(mean) - 2.0 * of_mean, 0.0) ** 2 > of_sign
     spectrum = np.abs(np.fft.rfft(np.nan_to_num(counted - np.nanmean(counted)))) ** 2
     line = float(np.convolve(spectrum, np.ones(3), "same").max() / spectrum.sum())
     short = 1.0 - float(expected.sum() / square.sum())  # where own noise and that of the channel are not enough
     if line >= NOISE_ALIKE * excess or short > 0.5 * NOISE_ALIKE * excess:
         return None
-    if max(np.mean(differs), np.mean(signed)) > NOISE_BY_CHANCE:
+    if not all(one.holds for one in tests) or np.mean(signed) > NOISE_BY_CHANCE:
         return None
-    told = float(np.median(deviation)) <= 0.5 * NOISE_ALIKE * excess
-    return Expected(float(np.sqrt(whole)), float(share), told)
+    told = bool(np.median([one.power for one in tests]) >= NOISE_TOLD)
+    return Expected(float(np.sqrt(whole)), float(share), told, float(hidden))
+
+
+class Alike(NamedTuple):
+    """Whether an error passes for alike in all bins of a condition, and the power of that test against an error found
+    in half of them alone.
+    """
+
+    holds: bool
+    power: float
+
+
+def _alike(ratio: Array, deviation: Array, n: Array, excess: float, level: float) -> Alike:
+    """The F test of a condition's bins: the variance between bins over that within them, from block to block, which is
+    pooled. Bins without samples do not count, and a single bin says nothing.
+
+    ratio, deviation  mean square of each bin over what is expected, and its standard deviation, float64[bins]
+    n       samples, float64[bins, blocks of the log]
+    excess  of the error over the floor, in mean squares of the error; noise is alike to `NOISE_ALIKE` of it, which
+            counts as two standard deviations
+    level   chance of an error that is alike to fail
+    """
+    there = n.any(axis=1)
+    ratio, deviation, n = ratio[there], deviation[there], n[there]
+    if len(ratio) < 2:
+        return Alike(True, 0.0)
+    samples, blocks = n.sum(axis=1), (n > 0.0).sum(axis=1) - 1.0
+    within, bins = max(float(blocks.sum()), 1.0), len(ratio) - 1
+    variance = float(np.sum(blocks * samples * deviation**2)) / within / samples + (0.5 * NOISE_ALIKE * excess) ** 2
+    most = float(scipy.special.fdtri(bins, within, 1.0 - level))
+    found, away = (float(np.sum(x**2 / variance)) for x in (ratio - 1.0, excess))
+    return Alike(found <= bins * most, float(1.0 - scipy.special.ncfdtr(bins, within, away, most)))
 
 
 def _of_parameters(judge: LeastSquaresProblem, theta: Array) -> Array:
@@ -190,16 +235,16 @@ def _of_parameters(judge: LeastSquaresProblem, theta: Array) -> Array:
 
 
 def bounded(a: Array, b: Array, most: Array) -> Array:
-    """The least squares of a x = b, float64[rows, 2], with both x from 0 to ``most``: inside, or on an edge."""
-    inside = np.linalg.lstsq(a, b, rcond=None)[0]
-    if np.all((inside >= 0.0) & (inside <= most)):
-        return np.asarray(inside)
+    """The least squares of a x = b, float64[rows, n], with each x from 0 to ``most``, which may be infinite: the best
+    of those with some x on an edge and the others inside.
+    """
     tried = []
-    for k in (0, 1):
-        for edge in (0.0, most[k]):
-            x = np.full(2, edge)
-            of = a[:, 1 - k]
-            x[1 - k] = np.clip(of @ (b - edge * a[:, k]) / max(of @ of, 1e-300), 0.0, most[1 - k])
+    for edges in product(*((np.nan, 0.0, one) if np.isfinite(one) else (np.nan, 0.0) for one in most)):
+        x = np.array(edges)
+        free = np.isnan(x)
+        x[free] = 0.0
+        x[free] = np.linalg.lstsq(a[:, free], b - a @ x, rcond=None)[0]
+        if np.all((x >= 0.0) & (x <= most)):
             tried.append(x)
     return min(tried, key=lambda x: float(np.sum((a @ x - b) ** 2)))
 
@@ -233,18 +278,21 @@ def _over_blocks(values: Array, expected: Array) -> tuple[Array, Array]:
 
 def _expect(stage: Stage, noise: Sequence[Expected], draws: Array | None) -> None:
     floor, size = np.asarray(stage.floor), np.array([one.size for one in noise])
-    if draws is not None:
-        stage.lost = draws * np.sqrt([one.share for one in noise])[:, None]
+    share, hidden = np.sqrt([(one.share, one.hidden) for one in noise]).T[:, :, None]
+    parts = [one * by for one, by in ((stage.lost, hidden), (draws, share)) if one is not None]
+    draw = np.arange(max(map(len, parts), default=0))
+    stage.lost = np.sum([one[draw % len(one)] for one in parts], axis=0) if parts else None
     more = np.sqrt(np.maximum(size**2 - floor**2, 0.0))
     stage.raster_error = np.hypot(0.0 if stage.raster_error is None else stage.raster_error, more)
     stage.floor = noise_of(stage, stage.neutral())
 
 
-def _said(stage: Stage, noise: Sequence[Expected], floor: Array) -> str:
-    """What is to be said of a stage that expects more than its ``floor``."""
+def _said(stage: Stage, noise: Sequence[Expected], floor: Array) -> list[str]:
+    """A note on a stage whose noise would fail by its ``floor``; none where it would not."""
     named = ", ".join(
         f"{name} {one.size:.3g} {unit} ({one.size / seen:.3g} times)"
         for name, unit, one, seen in zip(stage.outputs, stage.units, noise, floor, strict=True)
-        if one.size > seen
+        if one.size > AGREES * seen
     )
-    return f"{stage.name}: noise beyond what changes from row to row, the same under every condition: {named}"
+    said = f"{stage.name}: noise beyond what changes from row to row, the same under every condition: {named}"
+    return [said] if named else []
