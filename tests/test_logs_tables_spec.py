@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.logs import Channel, Log, LogError, csv_format, offered, plausible, read_log, source, transport, write_log
+from hil.logs import Channel, Log, LogError, csv_format, offered, plausible, source, transport, write_log
 from hil.logs import guess as guess_of
 from hil.logs import joined as joined_rows
 from hil.logs import log as logs
@@ -38,17 +38,9 @@ from hil.logs.table import NoTime, split_unit
 from hil.logs.times import guess_column, guess_unit
 from hil.logs.units import USUAL_UNITS, Units, factor_of
 from tests.conftest import examples
+from tests.small_logs import read
+from tests.small_logs import written as csv
 from vaneloop.base.signals import UNITS
-
-
-def csv(path: Path, text: str | bytes, name: str = "a.csv") -> Path:
-    file = path / name
-    file.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return file
-
-
-def read(file: Path, **options: Any) -> Log:
-    return read_log(file, **{"require": ()} | options)
 
 
 def values(file: Path, signal: str = "n_dem", **options: Any) -> list[float]:

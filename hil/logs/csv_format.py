@@ -116,7 +116,8 @@ def _day_beside(layout: Layout, time: str) -> str:
 
 
 def _parts(path: Path, raw: bytes, layout: Layout, time: str) -> tuple[bytes, tuple[int, ...]]:
-    """The text with empty rows in place of headers that stand in it again, and the rows (from 0) behind them.
+    """The text with empty rows in place of headers that stand in it again, units below them, too, and the rows (from 0)
+    behind these headers.
 
     Raises LogError for another header: the cells below it are of other columns.
     """
@@ -145,7 +146,7 @@ def _parts(path: Path, raw: bytes, layout: Layout, time: str) -> tuple[bytes, tu
             behind = line_at(raw, behind).behind
         out += [raw[kept:first], empty * raw.count(b"\n", first, behind)]
         kept = behind
-        parts.append(row + raw.count(b"\n", line.at, behind) - layout.first)
+        parts.append(row + 1 - layout.first)
         at = behind - 1
     return b"".join([raw[: layout.at], *out, raw[kept:]]), tuple(parts)
 

@@ -58,7 +58,7 @@ class Dates(NamedTuple):
     t: np.ndarray
     zero: int
     note: str
-    back: int = -1
+    back: int
 
 
 def from_dates(text: Any) -> Dates | OddRow | None:

@@ -18,6 +18,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -194,34 +195,27 @@ def _alike(parts: list[_Value]) -> tuple[list[_Value], Powers]:
     return out, unit
 
 
-def _sum(f: Callable[..., Any]) -> Callable[[list[_Value]], _Value]:
+def _sum(f: Callable[..., Any], parts: list[_Value]) -> _Value:
     """Of what has one unit, which stays."""
-
-    def of(parts: list[_Value]) -> _Value:
-        parts, unit = _alike(parts)
-        return _made(f, parts, unit, True)
-
-    return of
+    parts, unit = _alike(parts)
+    return _made(f, parts, unit, True)
 
 
 def _difference(parts: list[_Value]) -> _Value:
     """Of two temperatures it is in K: their zero has gone."""
     both = all(p.unit for p in parts)
-    out = _sum(operator.sub)(parts)
+    out = _sum(operator.sub, parts)
     return replace(out, unit=tuple((_degrees(s), p) for s, p in out.unit)) if both else out
 
 
-def _truth(f: Callable[..., Any]) -> Callable[[list[_Value]], _Value]:
+def _truth(f: Callable[..., Any], parts: list[_Value]) -> _Value:
     """1 where it is so, 0 where not, none where a part has none."""
 
     def whether(*x: Any) -> Any:
         out = np.asarray(f(*x), dtype=float)
         return np.where(np.any(np.broadcast_arrays(*(np.isnan(v) for v in x)), axis=0), np.nan, out)
 
-    def of(parts: list[_Value]) -> _Value:
-        return replace(_made(whether, _alike(parts)[0], NONE), held=True)
-
-    return of
+    return replace(_made(whether, _alike(parts)[0], NONE), held=True)
 
 
 def _times(parts: list[_Value]) -> _Value:
@@ -244,27 +238,23 @@ def _root(parts: list[_Value]) -> _Value:
     return _made(np.sqrt, parts, _product(NONE, parts[0].unit, Fraction(1, 2)))
 
 
-def _plain(f: Callable[..., Any]) -> Callable[[list[_Value]], _Value]:
+def _plain(f: Callable[..., Any], parts: list[_Value]) -> _Value:
     """Of the number as it stands; the result has no unit."""
-    return lambda parts: _made(f, parts, NONE)
+    return _made(f, parts, NONE)
 
 
-def _of_angle(f: Callable[..., Any]) -> Callable[[list[_Value]], _Value]:
+def _of_angle(f: Callable[..., Any], parts: list[_Value]) -> _Value:
     """Of an angle: in its unit, or in rad where it has none; of a time, too: a number before it is in rad/s."""
-
-    def of(parts: list[_Value]) -> _Value:
-        unit = parts[0].unit
-        factor = factor_of(_said(unit), "rad") if unit not in (NONE, _powers("s")) else (1.0, 0.0)
-        if not isinstance(factor, tuple):
-            raise _Refused(f"{_said(unit)} is no angle")
-        return _made(lambda x: f(factor[0] * x), parts, NONE)
-
-    return of
+    unit = parts[0].unit
+    factor = factor_of(_said(unit), "rad") if unit not in (NONE, _powers("s")) else (1.0, 0.0)
+    if not isinstance(factor, tuple):
+        raise _Refused(f"{_said(unit)} is no angle")
+    return _made(lambda x: f(factor[0] * x), parts, NONE)
 
 
-def _angle(f: Callable[..., Any]) -> Callable[[list[_Value]], _Value]:
+def _angle(f: Callable[..., Any], parts: list[_Value]) -> _Value:
     """What gives an angle, in rad, of what has one unit."""
-    return lambda parts: _made(f, _alike(parts)[0], _powers("rad"))
+    return _made(f, _alike(parts)[0], _powers("rad"))
 
 
 def _sampled(parts: list[_Value], name: str) -> tuple[Array, Array]:
@@ -324,23 +314,27 @@ class Function(NamedTuple):
 
 
 FUNCTIONS: dict[str, Function] = {
-    "abs": Function(1, 1, "size without sign", _sum(np.abs)),
-    "sign": Function(1, 1, "-1, 0 or 1", _plain(np.sign)),
-    "round": Function(1, 1, "nearest whole number", _sum(np.round)),
+    "abs": Function(1, 1, "size without sign", partial(_sum, np.abs)),
+    "sign": Function(1, 1, "-1, 0 or 1", partial(_plain, np.sign)),
+    "round": Function(1, 1, "nearest whole number", partial(_sum, np.round)),
     "sqrt": Function(1, 1, "square root", _root),
-    "exp": Function(1, 1, "e to the power of the number", _plain(np.exp)),
-    "log": Function(1, 1, "natural logarithm of the number", _plain(np.log)),
-    "log10": Function(1, 1, "decimal logarithm of the number", _plain(np.log10)),
-    "sin": Function(1, 1, "of an angle; a number without unit is in rad, and of `2 * pi * 50 * t`", _of_angle(np.sin)),
-    "cos": Function(1, 1, "the same", _of_angle(np.cos)),
-    "tan": Function(1, 1, "the same", _of_angle(np.tan)),
-    "asin": Function(1, 1, "angle in rad", _angle(np.arcsin)),
-    "acos": Function(1, 1, "angle in rad", _angle(np.arccos)),
-    "atan": Function(1, 1, "angle in rad", _angle(np.arctan)),
-    "atan2": Function(2, 2, "angle of y, x in rad", _angle(np.arctan2)),
-    "hypot": Function(2, 2, "square root of the sum of both squares", _sum(np.hypot)),
-    "min": Function(2, None, "the least, sample by sample", _sum(lambda *x: functools.reduce(np.minimum, x))),
-    "max": Function(2, None, "the greatest, sample by sample", _sum(lambda *x: functools.reduce(np.maximum, x))),
+    "exp": Function(1, 1, "e to the power of the number", partial(_plain, np.exp)),
+    "log": Function(1, 1, "natural logarithm of the number", partial(_plain, np.log)),
+    "log10": Function(1, 1, "decimal logarithm of the number", partial(_plain, np.log10)),
+    "sin": Function(
+        1, 1, "of an angle; a number without unit is in rad, and of `2 * pi * 50 * t`", partial(_of_angle, np.sin)
+    ),
+    "cos": Function(1, 1, "the same", partial(_of_angle, np.cos)),
+    "tan": Function(1, 1, "the same", partial(_of_angle, np.tan)),
+    "asin": Function(1, 1, "angle in rad", partial(_angle, np.arcsin)),
+    "acos": Function(1, 1, "angle in rad", partial(_angle, np.arccos)),
+    "atan": Function(1, 1, "angle in rad", partial(_angle, np.arctan)),
+    "atan2": Function(2, 2, "angle of y, x in rad", partial(_angle, np.arctan2)),
+    "hypot": Function(2, 2, "square root of the sum of both squares", partial(_sum, np.hypot)),
+    "min": Function(2, None, "the least, sample by sample", partial(_sum, lambda *x: functools.reduce(np.minimum, x))),
+    "max": Function(
+        2, None, "the greatest, sample by sample", partial(_sum, lambda *x: functools.reduce(np.maximum, x))
+    ),
     "mean": Function(1, 1, "one number: the mean over the log", _mean),
     "rate": Function(1, 1, "change per s, by central differences", _rate),
     "integral": Function(1, 1, "sum over time, by trapezoids, 0 at the first sample", _integral),
@@ -349,12 +343,13 @@ FUNCTIONS: dict[str, Function] = {
 }
 
 BINARY: dict[str, tuple[int, Callable[[list[_Value]], _Value]]] = {
-    "or": (1, _truth(lambda a, b: (a != 0.0) | (b != 0.0))),
-    "and": (2, _truth(lambda a, b: (a != 0.0) & (b != 0.0))),
-    "<": (4, _truth(operator.lt)), "<=": (4, _truth(operator.le)), ">": (4, _truth(operator.gt)),
-    ">=": (4, _truth(operator.ge)), "==": (4, _truth(operator.eq)), "!=": (4, _truth(operator.ne)),
-    "+": (5, _sum(operator.add)), "-": (5, _difference),
-    "*": (6, _times), "/": (6, _over), "%": (6, _sum(np.mod)),
+    "or": (1, partial(_truth, lambda a, b: (a != 0.0) | (b != 0.0))),
+    "and": (2, partial(_truth, lambda a, b: (a != 0.0) & (b != 0.0))),
+    "<": (4, partial(_truth, operator.lt)), "<=": (4, partial(_truth, operator.le)),
+    ">": (4, partial(_truth, operator.gt)), ">=": (4, partial(_truth, operator.ge)),
+    "==": (4, partial(_truth, operator.eq)), "!=": (4, partial(_truth, operator.ne)),
+    "+": (5, partial(_sum, operator.add)), "-": (5, _difference),
+    "*": (6, _times), "/": (6, _over), "%": (6, partial(_sum, np.mod)),
     "**": (8, _power), "^": (8, _power),
 }  # fmt: skip
 SIGNED = 7  # a sign binds tighter than a product, less than a power
@@ -436,14 +431,14 @@ class _Parser:
             return _Node(token.at, lambda channels: number)
         if token.text in ("+", "-") and token.kind == "sign":
             part = self.parsed(SIGNED)
-            return self.node(token, _sum(operator.neg if token.text == "-" else operator.pos), [part])
+            return self.node(token, partial(_sum, operator.neg if token.text == "-" else operator.pos), [part])
         if token.kind == "name" and token.text == "not":
-            return self.node(token, _truth(lambda x: x == 0.0), [self.parsed(NOT)])
+            return self.node(token, partial(_truth, lambda x: x == 0.0), [self.parsed(NOT)])
         if token.text == "(" and token.kind == "sign":
             node = self.parsed(0)
             self.needs(")", f"closes the bracket of position {token.at + 1}")
             return node
-        if token.kind in ("name", "quoted") and token.text not in BINARY:
+        if token.kind == "quoted" or (token.kind == "name" and token.text not in BINARY):
             after = self.tokens[self.k]
             if token.kind == "name" and after.text == "(" and after.kind == "sign":
                 return self.called(token)

@@ -58,6 +58,8 @@ def _known_units(path: Path, stated: Mapping[str, str], signals: Mapping[str, st
     for signal, unit in stated.items():
         gain, text, _ = scale_of(unit)
         own = signals.get(signal, "s")
+        if gain == 0.0:
+            raise LogError(f"{path}: --unit {signal}={unit}: its gain is 0; allowed: any other number")
         if signal == "state" or text == own or text.casefold() in NO_UNIT:
             continue
         speed = signal in ("n_dem", "n_r") and isinstance(factor_of(text, "rpm"), tuple)
@@ -66,8 +68,6 @@ def _known_units(path: Path, stated: Mapping[str, str], signals: Mapping[str, st
             what = f"unit is not known{meant(text, USUAL_UNITS)}" if factor is None else "unit does not convert"
             allowed = "%, rpm, Hz or rad/s" if signal in ("n_dem", "n_r") else f"{own} or what converts to it"
             raise LogError(f"{path}: --unit {signal}={unit}: {what}; allowed: {allowed}")
-        if gain == 0.0:
-            raise LogError(f"{path}: --unit {signal}={unit}: its gain is 0; allowed: any other number")
 
 
 @dataclass
@@ -76,7 +76,7 @@ class Opened:
 
     named    signal -> name in the log, where that is not our own: mapped or guessed
     units    signal -> unit in the log, where the user, a mapping file or a guess says it
-    absent   signals of the mapping file that the log does not have
+    absent   signals of the mapping file that the log does not have: signal -> words
     tables   of the machine, that a guess is held against
     unused   what is to be said of a database that the user names in vain
     """
@@ -124,10 +124,13 @@ def open_log(
     source = (opened or format_at(path).open)(path, options)
     if part and not isinstance(source, Table):
         raise LogError(f"{path}: part {part}: only tables have parts")
-    absent = {s: n for s, n in bench.names.items() if s not in given and s != "t" and not find(source, n, True)}
+    absent = {
+        s: f"{mapping_file} calls it {n!r}, which the log does not have"
+        for s, n in bench.names.items() if s not in given and s != "t" and not find(source, n, True)
+    }  # fmt: skip
     for signal in absent:
         del named[signal]
-    notes = [f"{s}: {mapping_file} calls it {n!r}, which the log does not have" for s, n in absent.items()]
+    notes = [f"{s}: {why}" for s, why in absent.items()]
     unused = ""
     if options.dbc is not None and not hasattr(source, "frames"):
         unused = f"{options.dbc}: not used, as the log holds no frames of a bus"

@@ -307,9 +307,10 @@ def longest_part(times: list[np.ndarray]) -> tuple[float, float, str, str]:
 
 def unit_of_time(t: np.ndarray) -> str:
     """Unit in which a time must count that is too long in s: the one that puts its rows nearest to a row each 10 ms."""
-    step = float(np.median(np.diff(np.unique(t)))) if t.size > 1 else 0.0
-    if not step > 0.0:
+    apart = np.diff(np.unique(t))
+    if not apart.size:
         return "ms"
+    step = float(np.median(apart))
     return min(CLOCKS, key=lambda unit: abs(np.log(step * CLOCKS[unit] / USUAL_STEP)))
 
 

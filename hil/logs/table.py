@@ -94,13 +94,13 @@ class Table:
         goes_on = all(a[-1] < b[0] for a, b in itertools.pairwise(told))
         part = self._part or (0 if goes_on else 1 + max(range(len(spans)), key=lambda k: spans[k].size))
         again = ", ".join(str(self._first + row - 1) for row in self._parts[1:6])
-        n = len(spans)
+        n, lost = len(spans), sum(s.size for k, s in enumerate(spans, 1) if part and k != part)
         done = f"part {part} of {n} is read" if part else f"its {n} parts are read as one, since time goes on"
         self.notes.append(
             Note(
                 f"rows: the header stands again in row {again}: {done}; --part N reads one of {n}",
                 "joined" if not part else "left out", "rows",
-                0 if not part else t.size - spans[part - 1].size, [self._first + row - 1 for row in self._parts[1:]],
+                lost, [self._first + row - 1 for row in self._parts[1:]],
             )
         )  # fmt: skip
         return slice(edges[part - 1], edges[part]) if part else slice(None)
