@@ -13,7 +13,8 @@ export default {
     // a width that is set while a figure is being drawn is lost: one after the other
     this.drawn = Plotly.newPlot(this.plot, this.options.data, this.options.layout, this.options.config);
     this.plot.on("plotly_click", (e) => this.go(e.points[0].customdata));
-    this.sizes = new ResizeObserver(() => { this.drawn = this.drawn.then(() => this.fit()); });
+    const fit = () => this.fit();
+    this.sizes = new ResizeObserver(() => { this.drawn = this.drawn.then(fit, fit); }); // after one that failed, too
     this.sizes.observe(this.$el);
   },
   unmounted() { this.sizes.disconnect(); Plotly.purge(this.plot); },
@@ -21,8 +22,7 @@ export default {
     fit() {
       const w = this.$el.clientWidth;
       if (w <= 0 || w === this.wide || !this.$el.isConnected) return;
-      this.wide = w;
-      return Plotly.relayout(this.plot, { width: w });
+      return Plotly.relayout(this.plot, { width: w }).then(() => { this.wide = w; });
     },
     go(t) { if (typeof t === "number") this.$emit("cell", t); },
     key_(e) {

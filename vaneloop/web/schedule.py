@@ -39,7 +39,6 @@ class Plan:
 
     geometry: Geometry
     schedules: Schedules
-    geometry_name: str = "geometry.toml"
     edited: bool = False
     log: LogFile | None = None
     options: dict[str, Any] = field(
