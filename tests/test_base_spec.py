@@ -11,10 +11,12 @@ import io
 import json
 import math
 import os
+import subprocess
 import sys
 import termios
 import threading
 import types as types_of_python
+import unicodedata
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,11 +25,13 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 from numba import njit, types
-from numba.core import codegen, compiler, config, errors
+from numba.core import codegen, compiler, config, errors, ir
 from pydantic import BaseModel, Field, ValidationError
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, RegularGridInterpolator
 
 from vaneloop.base import (
+    cells,
+    child,
     compiled,
     curve,
     durations,
@@ -37,11 +41,15 @@ from vaneloop.base import (
     hysteresis,
     kept,
     lean,
+    notebook,
+    quantities,
+    sizes,
     spans,
     terminal,
     vanes,
 )
 from vaneloop.base.errors import InputError, meant
+from vaneloop.base.holes import holes
 from vaneloop.base.hull import hull_of, nearest_within, within
 from vaneloop.base.side_by_side import shared_out, side_by_side
 from vaneloop.base.spans import Span
@@ -162,12 +170,157 @@ def test_what_is_written_is_brought_to_the_disk_with_its_name(tmp_path: Path, mo
     assert synced[-1] == tmp_path and (tmp_path / "b.txt").read_bytes() == b"bytes"
 
 
+def test_what_a_library_writes_is_brought_to_the_disk_with_the_old_file_s_rights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[tuple[str, int]] = []
+    monkeypatch.setattr(
+        files.os, "fsync", lambda fd: synced.append((os.readlink(f"/proc/self/fd/{fd}"), os.fstat(fd).st_size))
+    )
+    owners: list[tuple[int, int]] = []
+    file = tmp_path / "a.txt"
+    file.write_text("old")
+    for mode in (0o640, 0o440 if os.geteuid() == 0 else 0o600):
+        file.chmod(mode)
+        synced.clear()
+        before = len(os.listdir("/proc/self/fd"))
+        with files.whole(file) as part:
+            assert part.parent == tmp_path and part.name.startswith(".a.txt.") and part.name.endswith(".part")
+            assert part.stat().st_mode & 0o777 & ~mode & 0o077 == 0  # nobody reads it who may not read the old one
+            part.write_text("new one")
+            name = str(part)
+        assert len(os.listdir("/proc/self/fd")) == before
+        assert synced == [(name, 7), (str(tmp_path), tmp_path.stat().st_size)]
+        assert (
+            file.stat().st_mode & 0o777 == mode and file.read_text() == "new one" and len(list(tmp_path.iterdir())) == 1
+        )
+    now = os.stat(file)
+    monkeypatch.setattr(files.os, "chown", lambda name, *owner: owners.append(owner))
+    for owner in ((now.st_uid, now.st_gid), (now.st_uid + 1, now.st_gid), (now.st_uid, now.st_gid + 1)):
+        files._Target(str(file), str(file), 0o600, owner).finish()
+    assert owners == [(now.st_uid + 1, now.st_gid), (now.st_uid, now.st_gid + 1)]
+
+
+def test_a_file_is_made_where_its_links_lead_and_once(tmp_path: Path) -> None:
+    old, link, dangling = tmp_path / "old", tmp_path / "link", tmp_path / "dangling"
+    old.write_text("x")
+    link.symlink_to("old")
+    dangling.symlink_to(tmp_path / "new")
+    files.write(link, "y")
+    files.write(dangling, b"z")
+    assert link.is_symlink() and old.read_text() == "y" and (tmp_path / "new").read_bytes() == b"z"
+    chain = [tmp_path / f"l{k}" for k in range(41)]
+    for one, other in zip(chain, [*chain[1:], old], strict=True):
+        one.symlink_to(other)
+    assert files._behind_links(str(chain[2])) == (str(old), False)  # 39 links
+    for k in (0, 1):
+        with pytest.raises(InputError, match=rf"cannot write .*l{k}: Too many levels of symbolic links"):
+            files.write(chain[k], "w")
+    with pytest.raises(FileExistsError), files.replacing(old, only_new=True):
+        pass
+    with files.replacing(tmp_path / "first", only_new=True) as part:
+        part.write_text("1")
+    assert (tmp_path / "first").read_text() == "1"
+    for name, why in ((tmp_path, "Is a directory"), (f"{tmp_path}/no/x", "No such file"), (f"{tmp_path}/q/", "No such"),
+                      ("a\0b", "embedded null byte")):  # fmt: skip
+        with pytest.raises(InputError, match=f"^cannot write .*: {why}"):
+            files.check(name)
+    files.check(old)
+    files.check("/dev/null")
+    for at in ("/dev/null", "/proc/self/fd/1"):
+        assert files._begin(at) == (at, at, 0, (0, 0))
+    os.mkfifo(tmp_path / "pipe")
+    assert files._begin(tmp_path / "pipe").part == str(tmp_path / "pipe")
+    assert not [f for f in tmp_path.iterdir() if f.name.endswith(".part")]
+
+
 def test_a_page_is_offered_where_there_is_one() -> None:
     for report, options in ((None, ["json", "quiet"]), (False, ["json", "quiet"]), (True, ["report", "json", "quiet"])):
         parser = argparse.ArgumentParser()
         terminal.add_output_options(parser, *([] if report is None else [report]))
         assert list(vars(parser.parse_args([]))) == options
     assert parser.parse_args(["--quiet"]).quiet is True and parser.parse_args([]).json is None
+
+
+@pytest.mark.parametrize(("unit", "kind"), [
+    ("mm", "length"), (" mm ", "length"), ("deg", "angle"), ("l", "volume"), ("mm^3", "volume"), ("cm**3", "volume"),
+    ("m3", "volume"), ("deg3", ""), ("m2", ""), ("kg", "mass"), ("%", "share"), ("degC", "temperature"),
+    ("rpm", "angular velocity"), ("km/h", "velocity"), ("mm / s", "velocity"), ("mm s^-1", "velocity"),
+    ("m·s**-1", "velocity"), ("(mm)/s", "velocity"), ("deg/s", "angular velocity"), ("kg/s", ""), ("m/kg", ""),
+    ("mph", "velocity"), ("furlong", ""), ("", ""),
+])  # fmt: skip
+def test_a_unit_says_what_kind_of_quantity_it_is_of(unit: str, kind: str) -> None:
+    assert quantities.kind_of(unit) == kind
+
+
+def test_zeros_of_temperature_are_so_far_from_the_absolute_one() -> None:
+    found = {u: quantities.absolute_zero(u) for u in ("K", " degC", "°C", "deg C", "celsius", "degF", "°F", "mm")}
+    celsius, fahrenheit = 273.15, 273.15 * 9.0 / 5.0 - 32.0
+    assert found == {
+        "K": 0.0, " degC": celsius, "°C": celsius, "deg C": celsius, "celsius": celsius,
+        "degF": pytest.approx(fahrenheit), "°F": pytest.approx(fahrenheit), "mm": 0.0,
+    }  # fmt: skip
+
+
+def test_a_pause_of_more_than_ten_steps_is_a_hole() -> None:
+    even = np.arange(40.0)
+    for leap, found in ((10.0, []), (10.5, [19]), (12.0, [19])):
+        t = np.where(even > 19, even + leap - 1.0, even)
+        assert holes(t).tolist() == found
+    two = np.where(even > 30, even + 40.0, np.where(even > 9, even + 20.0, even))
+    assert holes(two).tolist() == [9, 30]  # two of forty may be followed by one, three may not
+    assert holes(np.where(even > 20, two + 50.0, two)).size == 0
+    assert holes(two[:39]).size == 0  # nor two of thirty-nine
+    assert holes(np.array([0.0, 1.0])).size == holes(np.zeros(30)).size == 0
+    assert holes(np.array([0.0, 1.0, 50.0])).size == 0
+
+
+@pytest.mark.parametrize(("text", "cell"), [
+    ("=1", "'=1"), ("+x", "'+x"), ("-a b", "'-a b"), ("@x", "'@x"), ("\tx", "'\tx"), ("\rx", "'\rx"), ("-", "-"),
+    ("'=1", "''=1"), ("'x", "'x"), ("a=1", "a=1"), ("", ""), ("=\n", "'=\n"),
+])  # fmt: skip
+def test_no_text_of_a_cell_is_a_formula_and_each_comes_back(text: str, cell: str) -> None:
+    assert cells.marked(text) == cell and cells.unmarked(cell) == text
+
+
+def test_numbers_too_small_or_too_large_to_be_squared_are_told() -> None:
+    values = np.array([0.0, 1e-60, -1e-60, 0.9e-60, -0.9e-60, 1e60, 1.1e60, -1.1e60, np.inf])
+    assert sizes.no_smaller(values).tolist() == [0.0, 1e-60, -1e-60, 0.0, 0.0, 1e60, 1.1e60, -1.1e60, np.inf]
+    assert sizes.beyond(values).tolist() == [False] * 6 + [True] * 3
+    same = np.array([0.0, 1.0])
+    assert sizes.no_smaller(same) is same
+
+
+def test_a_result_is_shown_as_text_and_as_html() -> None:
+    assert [notebook.shown(v) for v in (None, math.nan, True, False, 1.23456, 12_345, "t", 0)] == [
+        "", "", "yes", "no", "1.235", "12,345", "t", "0"
+    ]  # fmt: skip
+    assert notebook.shown(1.23456, 2) == "1.2"
+    columns, rows = ["name", "n", "good"], [["a<b", 1.5, True], ["longer", 1234, False]]
+    assert notebook.text_table(columns, rows).split("\n") == [
+        "name        n  good", "a<b       1.5  yes", "longer  1,234  no",
+    ]  # fmt: skip
+    right, left = 'style="text-align:right"', 'style="text-align:left"'
+    assert notebook.html_table(columns, rows, "a & b") == (
+        f'<table><caption {left}>a &amp; b</caption><thead><tr><th scope="col" {left}>name</th>'
+        f'<th scope="col" {right}>n</th><th scope="col" {left}>good</th></tr></thead><tbody>'
+        f"<tr><td {left}>a&lt;b</td><td {right}>1.5</td><td {left}>yes</td></tr>"
+        f"<tr><td {left}>longer</td><td {right}>1,234</td><td {left}>no</td></tr></tbody></table>"
+    )
+    assert "<caption" not in notebook.html_table(columns, rows)
+
+
+def test_a_surface_is_straight_between_its_points_and_stays_as_at_its_edges() -> None:
+    rng = np.random.default_rng(5)
+    table = rng.normal(size=(5, 4))
+    xs, zs = np.linspace(10.0, 20.0, 5), np.linspace(-1.0, 1.0, 4)
+    scipys = RegularGridInterpolator((xs, zs), table)
+    for x, z in rng.uniform((8.0, -1.3), (22.0, 1.3), (50, 2)):
+        want = float(scipys([np.clip(x, 10.0, 20.0), np.clip(z, -1.0, 1.0)])[0])
+        assert curve.on_grid.py_func(x, z, LOW, HIGH, table) == pytest.approx(want)
+        line = float(np.interp(x, xs, table[:, 0]))
+        assert curve.on_table.py_func(x, 10.0, 20.0, table[:, 0]) == pytest.approx(line)
+        assert curve.on_even.py_func(x, 10.0, 0.4, table[:, 0]) == pytest.approx(line)
 
 
 # ---- parts of logs ---------------------------------------------------------------------------------------------------
@@ -348,6 +501,34 @@ def test_formulas_have_the_values_of_their_texts() -> None:
             assert (level - half, level + half) == (pytest.approx(below), pytest.approx(above))
 
 
+def test_formulas_stay_finite_up_to_their_limits_and_not_beyond() -> None:
+    """At each limit and a third beyond it; closed forms, a = 3."""
+    of = {
+        form.name: lambda q, *n, form=form: float(form.value(np.array(q), np.array([3.0, *n]))) for form in forms.FORMS
+    }
+    for q, least in ((1e-12, 1e-12), (1.3e-12, 1.3e-12), (0.7e-12, 1e-12), (-0.7e-12, 1e-12), (2.0, 2.0)):
+        assert of["power"](q, -1.0) == pytest.approx(math.copysign(3.0 / least, q))
+        assert of["inverse"](abs(q)) == pytest.approx(3.0 / least)
+    for b, used in ((8.0, 8.0), (10.0, 8.0), (-8.0, -8.0), (-10.0, -8.0), (7.0, 7.0)):
+        assert of["power"](2.0, b) == pytest.approx(3.0 * 2.0**used)
+    for x, used in ((50.0, 50.0), (65.0, 50.0), (40.0, 40.0), (-65.0, -50.0), (-3.0, -3.0)):
+        assert of["exponential"](x, 1.0) == pytest.approx(3.0 * math.expm1(used))
+        assert of["gentle step"](-x, 0.0, 1.0) == pytest.approx(3.0 / (1.0 + math.exp(used)), rel=1e-9)
+        kelvin = x / (1.0 / 300.0 - 1.0 / 600.0)  # at 600 K
+        assert of["Arrhenius"](600.0 - 273.15, kelvin) == pytest.approx(3.0 * math.exp(used))
+    assert of["quotient"](1.0, -0.9985) == pytest.approx(3.0 / 1.5e-3) and of["quotient"](1.0, -2.0) == 3.0 / 1e-3
+    assert of["gentle step"](1e-9, 0.0, 0.1e-9) == pytest.approx(3.0 / (1.0 + math.exp(-1.0)))
+    assert of["gentle step"](1e-9, 0.0, 2e-9) == pytest.approx(3.0 / (1.0 + math.exp(-0.5)))
+
+
+def test_the_numbers_to_begin_from_are_within_the_range_or_about_it() -> None:
+    starts = {form.name: [one for _, one in form.inner] for form in forms.FORMS if form.inner}
+    for kinds in starts.values():
+        assert all(len(set(one)) == len(one) for one in kinds)
+    at = starts["step"][0]
+    assert len(at) == 97 and at == pytest.approx([0.02 + 0.01 * k for k in range(97)])
+
+
 def test_signs_that_change_nothing_are_dropped_and_only_those() -> None:
     q = np.linspace(-3.0, 3.0, 25)
     for form in forms.FORMS:
@@ -356,6 +537,7 @@ def test_signs_that_change_nothing_are_dropped_and_only_those() -> None:
         assert plain.tolist() == [abs(v) if i in form.magnitudes else v for i, v in enumerate(numbers)]
         assert form.positive or form.value(q, plain) == pytest.approx(form.value(q, numbers)), form.name
         assert form.magnitudes == {"gentle step": (2,), "dead zone": (1,), "limit": (1,)}.get(form.name, ())
+        assert form.positive == (form.name == "inverse")
         assert form.signed == (form.name in ("magnitude", "sign", "signed square", "dead zone")), form.name
 
 
@@ -387,6 +569,24 @@ def test_work_is_shared_out_once_and_answers_keep_their_order(
     assert found == [(k, shared, inner) for k in range(items)] and not shared_out()
 
 
+def test_what_nobody_waits_for_any_more_is_not_begun(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vaneloop.base.side_by_side.threads", lambda: 2)
+    begun: list[int] = []
+    go = threading.Event()
+
+    def of(item: int) -> int:
+        begun.append(item)
+        if item:
+            go.wait(10.0)
+        return item
+
+    answers = side_by_side(of, range(50))
+    assert next(answers) == 0
+    threading.Timer(0.05, go.set).start()
+    answers.close()  # type: ignore[attr-defined]
+    assert len(begun) < 10
+
+
 # ---- what a command prints -------------------------------------------------------------------------------------------
 
 
@@ -415,7 +615,9 @@ def test_pairs_are_split_and_given_once() -> None:
         terminal.pairs(["vgiv=1"], "map", known, "vigv, n_r")
 
 
-def test_json_has_plain_numbers_and_null_for_none(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_json_has_plain_numbers_and_null_for_none(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = {
         1: np.float64(2.5), "b": np.array([1.0, np.nan]), "c": (np.inf, np.int64(3), True, None, "t"),
         "d": {"e": [np.array(4)]}, "f": -math.inf, "g": [np.bool_(False)],
@@ -426,8 +628,15 @@ def test_json_has_plain_numbers_and_null_for_none(capsys: pytest.CaptureFixture[
     assert terminal.plain(data) == expected and terminal.plain(0.0) == 0.0
     terminal.write_json(said(), data)
     assert capsys.readouterr().out == ""
+    monkeypatch.chdir(tmp_path)
     terminal.write_json(said(to="-"), data)
-    assert json.loads(capsys.readouterr().out) == expected
+    assert json.loads(capsys.readouterr().out) == expected and list(tmp_path.iterdir()) == []
+    out = Told()
+    monkeypatch.setattr(sys, "stdout", out)
+    terminal.write_json(said(to="-"), data)
+    terminal.say(said(), "text")
+    assert out.flushed == 2  # whoever reads it need not wait for the end
+    monkeypatch.undo()
     terminal.write_json(said(to=str(tmp_path / "x.json")), data)
     written = (tmp_path / "x.json").read_text()
     assert json.loads(written) == expected and written.endswith("}\n") and written.startswith('{\n  "1"')
@@ -558,6 +767,31 @@ def test_control_characters_are_shown() -> None:
     assert terminal.clean("a\x1b[31m\n\u202eb\udc80") == "a\\x1b[31m\\x0a\\u202eb\\udc80"
     assert terminal.clean("a\nb\tc\x7f\x9f\xa0", lines=True) == "a\nb\\x09c\\x7f\\x9f\xa0"
     assert terminal.clean("\x1f \u2027\u2028\u2065\u2069\u206a") == "\\x1f \u2027\\u2028\u2065\\u2069\u206a"
+
+
+def test_what_turns_or_hides_text_is_shown_and_nothing_else() -> None:
+    turns = {0x061C, 0x200E, 0x200F, *range(0x2028, 0x202F), *range(0x2066, 0x206A)}
+    for code in range(0x3000):
+        shown = unicodedata.category(chr(code)) == "Cc" or code in turns
+        assert terminal.clean(chr(code)) == (repr(f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}")[1:-1].replace(
+            "\\\\", "\\") if shown else chr(code)), hex(code)  # fmt: skip
+
+
+def test_what_a_user_asked_for_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/vaneloop", "run", "--bus", "vcan0"])
+    assert terminal.typed("run") == "vaneloop run --bus vcan0"
+    assert terminal.number("1e3") == 1000.0 and math.isnan(terminal.number("x")) and math.isnan(terminal.number(""))
+
+
+def test_a_process_of_ours_takes_no_module_from_where_the_user_stands(tmp_path: Path) -> None:
+    (tmp_path / "json.py").write_text("print('theirs')")
+    says = child.python("import json, sys, vaneloop; print(json.dumps(sys.argv[1:]))", "a", "b c")
+    assert says[1:3] == ["-P", "-c"] and says[4:] == ["a", "b c"] and says[0] == sys.executable
+    plain = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    done = subprocess.run(says, cwd=tmp_path, capture_output=True, text=True, check=True, env=plain)
+    assert done.stdout == '["a", "b c"]\n'
+    module = child.python_module("some.module", "a")
+    assert "runpy.run_module('some.module', run_name='__main__', alter_sys=True)" in module[3] and module[4:] == ["a"]
 
 
 class Told(io.StringIO):
@@ -706,7 +940,8 @@ def test_compiled_code_is_kept_where_that_can_be_written(tmp_path: Path, monkeyp
     monkeypatch.setattr(compiled, "__file__", str(tmp_path / "package" / "compiled.py"))
     monkeypatch.setattr(Path, "home", classmethod(lambda cls: cls(tmp_path / "home")))
     name = f"compiled-{kept.sources_digest()}"
-    assert folder() == tmp_path / "package" / "__pycache__" / name
+    for _ in range(2):  # it may be there already
+        assert folder() == tmp_path / "package" / "__pycache__" / name
     refused = {tmp_path / "package" / "__pycache__"}
     monkeypatch.setattr(compiled.os, "access", lambda place, mode: place not in refused and mode == compiled.os.W_OK)
     cache = tmp_path / "home" / ".cache" / "vaneloop"
@@ -758,7 +993,121 @@ def test_names_and_kinds_of_numbers_are_in_a_function_s_digest() -> None:
     digests += [digest("def f(x): return k * x", k=k) for k in (np.float32(1.0), np.float32(2.0), np.int8(1))]
     for stamp in ("one", "two"):
         digests.append(digest("def f(x): return g(x)", g=SimpleNamespace(vaneloop_digest=stamp)))
+    digests += [digest(f"def f(x, y): return x {sign} y") for sign in "+-"]  # nothing but the bytecode differs
+    digests += [digest("def f(x): return g(x)", g=g) for g in (math.sin, math.cos, np.sin, abs, kept.digest_of)]
+    digests += [digest("def f(x): return k[0] * x", k=k) for k in ((1.0,), (2.0,), (1,), (1.0, 1.0), np.ones(1))]
+    digests += [digest(f"def f(x): return (lambda y: y + {n})(x)") for n in (1, 2)]
     assert all(digests) and len(set(digests)) == len(digests)
+    assert digest("def f(x): return k[0]", k=([1.0],)) == digest("def f(x): return g(x)", g=SimpleNamespace()) == ""
+
+
+def test_what_is_compiled_follows_from_every_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = kept.sources_digest.__wrapped__
+    assert whole() == kept.sources_digest()
+    monkeypatch.setattr(kept, "_ROOT", tmp_path)
+    (tmp_path / "plant" / "effects").mkdir(parents=True)
+    (tmp_path / "vaneloop" / "pages").mkdir(parents=True)
+    digests = [whole()]
+    for name in ("plant/a.py", "plant/effects/b.py", "vaneloop/pages/c.py", "plant/d.txt"):
+        (tmp_path / name).write_text("x = 1")
+        digests.append(whole())
+    (tmp_path / "plant" / "a.py").write_text("x = 2")
+    digests.append(whole())
+    monkeypatch.setattr(kept.numba, "__version__", "0.0")
+    digests.append(whole())
+    assert digests[2:5] == [digests[2]] * 3 and len(set(digests)) == 5  # pages and texts are not compiled
+
+
+def test_a_user_s_function_is_compiled_under_its_digest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(kept, "AHEAD", tmp_path / "ahead")
+
+    def scaled(x: float, by: float = 2.0) -> float:
+        return by * x
+
+    def moved(x: float, *, plus: float = 1.0) -> float:
+        return x + plus
+
+    of = kept.kept_njit(scaled)
+    digest = kept.digest_of(scaled)
+    assert of.vaneloop_digest == digest and of.py_func.__qualname__ == f"scaled_{digest[:24]}"
+    assert (of.py_func.__module__, of.py_func.__defaults__) == (kept.__name__, (2.0,))
+    assert kept.kept_njit(moved).py_func.__kwdefaults__ == {"plus": 1.0}
+    assert of(3.0) == 6.0 and len(list((tmp_path / "own").iterdir())) == 1 and kept.is_kept(of)
+    thing = object()
+
+    def unknown(x: float) -> float:
+        return x if thing is None else 2.0 * x
+
+    names = [kept.kept_njit(unknown).py_func.__qualname__ for _ in range(2)]
+    assert len(set(names)) == 2 and all(n.startswith("unknown_") for n in names)
+    assert not hasattr(kept.kept_njit(unknown), "vaneloop_digest")
+
+
+def test_a_user_is_told_of_compiling_once_unless_the_command_has_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(terminal, "is_command", True)
+    monkeypatch.setattr(sys, "argv", ["vaneloop", "run"])
+    line = "vaneloop: compiling what has not run on this machine before (once, it is kept) ...\n"
+    for told in (False, True):
+        monkeypatch.setattr(terminal, "told_of_compiling", told)
+        waiting = kept.Waiting(60.0)
+        waiting.on_start(None)
+        timer = waiting.timer
+        assert timer is not None and timer.daemon and timer.interval == 60.0 and timer.is_alive()
+        waiting.on_start(None)
+        assert waiting.timer is timer and waiting.depth == 2
+        waiting.tell()
+        assert waiting.told == (not told) and capsys.readouterr().err == ("" if told else line)
+        waiting.on_end(None)
+        assert terminal.told_of_compiling == told and not timer.finished.is_set()
+        waiting.on_end(None)
+        assert timer.finished.is_set() and not terminal.told_of_compiling and waiting.depth == 0
+        waiting.on_start(None)
+        assert (waiting.timer is timer) == (not told)  # once is enough
+        waiting.on_end(None)
+    monkeypatch.setattr(terminal, "told_of_compiling", False)
+    for words, command in ((["vaneloop", "--quiet"], True), (["vaneloop"], False)):
+        monkeypatch.setattr(sys, "argv", words)
+        monkeypatch.setattr(terminal, "is_command", command)
+        terminal.compiling()
+    terminal.say(said(quiet=True), "compiling the simulator")
+    assert terminal.told_of_compiling and capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(("addresses", "loops", "keeps"), [(False, [], 1), (True, [], 0), (False, ["a loop"], 0)])
+def test_code_that_holds_addresses_of_this_process_is_not_kept(
+    addresses: bool, loops: list[str], keeps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    of = kept._Files(math_free, lambda: "a stamp", "")
+    monkeypatch.setattr(of, "_index_key", lambda sig, codegen: (sig, codegen), raising=False)
+    code = SimpleNamespace(
+        library=SimpleNamespace(has_dynamic_globals=addresses), lifted=loops, codegen="c", _reduce=lambda: ("made",)
+    )
+    of.save_overload("sig", code)
+    assert len(list(tmp_path.iterdir())) == keeps
+    of.flush()
+    of.flush()
+    assert list(tmp_path.iterdir()) == []
+
+
+def math_free(x: float) -> float:
+    """A function of a file."""
+    return x
+
+
+def test_variables_are_found_however_deep_an_instruction_holds_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not lean.is_known():
+        return
+    scope = ir.Scope(None, loc := ir.Loc("f.py", 1))
+    a, b, c, d = (ir.Var(scope, name, loc) for name in "abcd")
+    inner = ir.Expr.binop(print, a, b, loc)
+    monkeypatch.setattr(lean, "_NO_VARIABLES", set())
+    held = {"value": inner, "more": [c, ("word", 3, {"deep": d})], "none": None}
+    assert lean._variables(None, held) == lean._variables(None, held) == [a, b, c, d]
+    assert {str, int, type(None)} <= lean._NO_VARIABLES and ir.Var not in lean._NO_VARIABLES
 
 
 def test_what_is_changed_inside_numba(monkeypatch: pytest.MonkeyPatch) -> None:

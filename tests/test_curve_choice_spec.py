@@ -16,6 +16,7 @@ from hypothesis import settings as settings_of
 from hypothesis import strategies as st
 
 from tests.conftest import examples
+from tests.small_logs import white
 from vaneloop.base.forms import FORMS
 from vaneloop.identification import Parameter, Stage
 from vaneloop.identification.candidates.closed_forms import Formula
@@ -77,10 +78,6 @@ N = 480
 T = 0.1 * np.arange(N)
 U = 1.5 * np.sin(0.9 * T) + 0.7 * np.sin(2.3 * T + 1.0)
 FLOOR = 0.1
-
-
-def white(seed: int, *shape: int) -> Array:
-    return np.random.default_rng(seed).standard_normal(shape)
 
 
 def candidate(name: str = "u", at: str = "y", how: str = "output adds", x: Array = U, **more: Any) -> Candidate:
@@ -1203,6 +1200,6 @@ def test_names_of_a_model_say_which_curve_a_formula_stands_for() -> None:
     assert t.forgotten() is None and t.settled is None
     assert t.slopes().columns.tolist() == []  # a stage keeps them that carries them along
     t.judge.stage.carries = True
-    t.fit = t.judge.fit((t.candidate.name,), t.fit.theta)
+    t.fit = t.judge.fit((t.candidate.name,), t.judge.stage.neutral(), 1)  # it ends on its only step
     slopes = t.slopes()
     assert slopes.columns.tolist() == [0] and len(t.slopes(beside=False).columns) == len(t.fit.free)

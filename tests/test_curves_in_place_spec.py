@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.small_logs import white
 from tests.test_curve_choice_spec import chooser, ordering, tried
 from vaneloop import Record, System, unknown
 from vaneloop.base.forms import FORMS
@@ -61,10 +62,6 @@ N = 200
 T = 0.1 * np.arange(N)
 U = 1.5 * np.sin(0.9 * T) + 0.7 * np.sin(2.3 * T + 1.0)
 W = 2.0 + np.cos(0.37 * T) + 0.5 * np.sin(1.9 * T)
-
-
-def white(seed: int, *shape: int) -> Array:
-    return np.random.default_rng(seed).standard_normal(shape)
 
 
 def gain(u: Any, p: Any) -> Any:

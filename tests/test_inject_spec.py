@@ -1457,17 +1457,17 @@ def test_a_machine_with_more_stages_sends_more_and_claims_of_stages_it_lacks_are
 def test_what_is_done_to_an_actuator_that_the_machine_lacks_is_refused() -> None:
     def lacks(kind: str, **keys: Any) -> str:
         of = Scenario(title="made", duration=1.0, inject=[inject.Drop(), inject.Machine(**keys)])
-        return injection.lacks(of, SimpleNamespace(kind=kind))  # type: ignore[arg-type]
+        return injection.lacks(of, build_plant({"hydraulic": "plant.toml"}.get(kind, f"plant_{kind}.toml")))
 
     assert lacks("hydraulic", p_s=1.0) == lacks("electromechanical", t_oil=1.0) == ""
     assert lacks("electromechanical", p_s=1.0) == "machine: p_s: the electromechanical actuator takes no oil"
     assert lacks("hydraulic", effect="valve_lag") == lacks("electromechanical", effect="amplifier_lag") == ""
     assert lacks("hydraulic", effect="amplifier_lag") == (
-        "machine: effect amplifier_lag: not of an actuator of kind hydraulic"
+        "machine: effect amplifier_lag is of an actuator of kind electromechanical; this machine's is hydraulic"
     )
     motor = Scenario(title="made", duration=1.0, inject=[inject.Machine(effect="amplifier_lag")])
     with pytest.raises(
-        InputError, match="^scenario: machine: effect amplifier_lag: not of an actuator of kind hydraul"
+        InputError, match="^scenario: machine: effect amplifier_lag is of an actuator of kind electromech"
     ):
         inject.run(motor, plant=build_plant())
 

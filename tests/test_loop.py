@@ -21,13 +21,14 @@ from hil.loop.node import replay as repeat
 from hil.loop.tick import arrive, new_loop
 from hil.replay import replay
 from plant import Model, Plant, build_plant
-from plant.effect import MOTOR
+from plant.effect import MOTOR, PAIR
 from plant.effects import EFFECTS
 from tests.effect_table import EXAMPLES
 from vaneloop.base.vanes import VANES
 
 # a gross size of each effect, in declared units
 GROSS = {name: example.gross for name, example in EXAMPLES.items()}
+ALONE = [name for name, e in EFFECTS.items() if e.kinds != PAIR]  # those of a pair: tests/test_two_actuators.py
 ELECTRIC = {name for name, e in EFFECTS.items() if e.kinds == MOTOR}
 
 
@@ -113,7 +114,7 @@ def way(request: pytest.FixtureRequest):
     return request.param, run, run(machine(), ()), run(machine("aero_load"), ("aero_load",)), electric
 
 
-@pytest.mark.parametrize("name", EFFECTS)
+@pytest.mark.parametrize("name", ALONE)
 def test_every_effect_acts_in_lockstep_node_replay_and_injection_alike(way, name: str) -> None:
     called, run, plain, loaded, electric = way
     under = ("aero_load",) if name in LOADED else ()
@@ -129,7 +130,7 @@ def raw(percent: np.ndarray) -> np.ndarray:
     return np.array([frames.decode_demand(frames.encode_demand(v, v, 1, 0))[0] for v in percent])
 
 
-@pytest.mark.parametrize("name", EFFECTS)
+@pytest.mark.parametrize("name", ALONE)
 def test_an_effect_acts_by_the_same_amount_in_lockstep_and_node_bit_for_bit(name: str) -> None:
     plant = machine("aero_load", name) if name in LOADED else machine(name)
     demand = raw(DEMAND)
@@ -149,7 +150,7 @@ def test_an_effect_acts_by_the_same_amount_in_lockstep_and_node_bit_for_bit(name
     assert np.array_equal(node.loop.s, loop.s)
 
 
-@pytest.mark.parametrize("name", [n for n in EFFECTS if n not in LOADED])
+@pytest.mark.parametrize("name", [n for n in ALONE if n not in LOADED])
 def test_an_effect_injected_at_power_on_is_the_effect_in_the_machine(name: str) -> None:
     made = machine(name)
     fixed, changed = Node(made, n_r=60.0, t_oil=T_OIL), Node(nominal(name), n_r=60.0, t_oil=T_OIL)

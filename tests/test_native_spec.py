@@ -4,12 +4,15 @@ its process is told.
 
 from __future__ import annotations
 
+import copyreg
 import ctypes
 import faulthandler
 import gc
 import json
 import os
+import pickle
 import resource
+import shutil
 import signal
 import struct
 import sys
@@ -57,6 +60,13 @@ const vaneloop_description *vaneloop_describe(void) { return &about; }
 size_t vaneloop_save(void *at) { if (at) memcpy(at, &seen, sizeof seen); return sizeof seen; }
 void vaneloop_restore(const void *at) { memcpy(&seen, at, sizeof seen); }
 """
+
+
+class OfTwo(Exception):
+    """One that pickle writes, but cannot read."""
+
+    def __init__(self, a: int, b: int):
+        super().__init__(f"{a} and {b}")
 
 
 @pytest.fixture(scope="module")
@@ -152,6 +162,17 @@ def test_a_calibration_is_the_same_memory_twice_once_to_write() -> None:
     del mine, array, told
     gc.collect()
     assert not set(addresses) & set(_VIEWS)
+
+
+def test_a_controller_that_nobody_has_any_more_is_unloaded(gcc: str, tmp_path: Path) -> None:
+    left = tmp_path / "left"
+    ends = f'__attribute__((destructor)) static void end(void) {{ fclose(fopen("{left}", "w")); }}'
+    foreign = Program(wrong(gcc, tmp_path, top=ends)).start(CAL)
+    at, head = foreign.at_fed, foreign.box
+    assert at in program._KEPT and not left.exists()
+    del foreign
+    gc.collect()
+    assert at not in program._KEPT and left.exists() and head[CALL] == STEP
 
 
 # ---- what a library is given, and what it says -----------------------------------------------------------------------
@@ -445,6 +466,50 @@ def test_a_box_of_every_tick_keeps_them_all(watched: Path) -> None:
     assert black_box.progress(watched) == black_box._OVERWRITTEN and black_box.left(watched) is None
 
 
+def test_the_box_of_the_controller_that_was_called_is_found_among_others(watched: Path) -> None:
+    black_box.watched(watched, every_tick=False)
+    heads = [black_box.new(f"{n}.so", CAL)[0] for n in range(4)]
+    called = sorted(
+        range(4), key=lambda n: next(f.name for f in watched.glob("*.json") if f'"{n}.so"' in f.read_text())
+    )
+    heads[called[1]][CALL] = 77.0  # overwritten: no such function
+    heads[called[3]][CALL] = 3.0
+    box = black_box.left(watched)
+    assert box is not None and box.controller == f"{called[3]}.so" and box.call == "vaneloop_init"
+    assert box.tick == -1 and box.inputs.shape == (0, len(INPUTS))  # none was begun
+    assert len(black_box.progress(watched)) == 2 * 8 * N_HEAD
+
+
+@pytest.mark.parametrize(("every_tick", "kept"), [(True, [0, 1, 2, 3, 0, 0]), (False, [0, 1, 1, 1, 1, 1])])
+def test_a_box_keeps_what_it_has_room_for(
+    every_tick: bool, kept: list[int], watched: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(black_box, "EVERY_TICK", 3)
+    black_box.watched(watched, every_tick=every_tick)
+    head, rows = black_box.new("c.so", CAL)
+    rows[:] = np.arange(1.0, len(rows) + 1.0)[:, None]
+    for ticks, n in enumerate(kept):
+        head[ENTERED], head[RETURNED] = ticks, -1.0
+        box = black_box.left(watched)
+        assert box is not None and box.tick == ticks - 1 and box.inputs[:, 0].tolist() == list(range(1, n + 1))
+
+
+def test_a_box_takes_its_room_on_the_disk_before_the_first_tick(watched: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Head and first row: a disk that fills up later would end the process in the controller's name."""
+    asked: list[tuple[int, int]] = []
+
+    def full(handle: int, begin: int, many: int) -> None:
+        asked.append((begin, many))
+        raise OSError(28, "No space left on device")
+
+    black_box.watched(watched, every_tick=True)
+    before = len(os.listdir("/proc/self/fd"))
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(InputError, match="No space left on device"):
+        black_box.new("c.so", CAL)
+    assert asked == [(0, 8 * (64 + len(INPUTS)))] and len(os.listdir("/proc/self/fd")) == before
+
+
 # ---- how the end is told ---------------------------------------------------------------------------------------------
 
 
@@ -503,6 +568,10 @@ def test_how_a_process_ended_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     monkeypatch.setattr(crash_log, "write", write)
     assert isolation._failure(tmp_path, _End(5, signal.SIGSEGV), "f").endswith("after power-on; crash log: f")
     assert len(wrote) == 1
+    monkeypatch.setattr(black_box, "left", lambda folder: box_of(tick=0, inputs=np.zeros((1, len(INPUTS)))))
+    first = isolation._failure(tmp_path, _End(5, signal.SIGSEGV), "f")
+    assert ", in tick 0, 0.000 s after power-on; last inputs: " in first and first.endswith("; crash log: f")
+    wrote.pop()
     monkeypatch.setattr(black_box, "left", lambda folder: box_of(tick=-1))
     assert not isolation._failure(tmp_path, _End(5, signal.SIGSEGV), "f").endswith("crash log: f") and len(wrote) == 1
     assert isolation._name(signal.SIGRTMIN + 1) == f"signal {signal.SIGRTMIN + 1}"
@@ -548,6 +617,26 @@ def test_an_exception_comes_back_with_its_traceback_or_in_words() -> None:
     assert isolated(lambda: {"n": 3}) == {"n": 3}
     with pytest.raises(ControllerFailed, match=r"^the process with the controller ended with code 3, outside a call"):
         isolated(lambda: os._exit(3))
+
+
+def test_an_exception_that_cannot_be_made_anew_comes_as_its_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It can be written, but its own text is no argument of it. Libraries that teach pickle all exceptions make it."""
+    monkeypatch.delitem(copyreg.dispatch_table, OfTwo, raising=False)
+    good, what, lines = pickle.loads(isolation._pickled(False, OfTwo(1, 2)))
+    assert not good and type(what) is RuntimeError and str(what) == "OfTwo: 1 and 2" and "OfTwo" in lines
+
+
+def test_a_task_that_takes_away_its_folder_is_told_so() -> None:
+    with pytest.raises(ControllerFailed, match=r"^the process with the controller ended what watches it, or took away"):
+        isolated(lambda: shutil.rmtree(black_box._WATCHED[0][0]))
+
+
+def test_how_long_is_waited_is_as_the_guide_says() -> None:
+    guide = (Path(isolation.__file__).parents[2] / "docs" / "own_controller.md").read_text()
+    assert f"does not come back from a call within {isolation.PATIENCE:g} s" in guide
+    assert f"ignores Ctrl-C or SIGTERM for {isolation._ENDING:g} s" in guide
+    assert f"more than {program._MOST:,} quantities, a state above {program._MOST_STATE >> 20} MiB" in guide
+    assert isolated.__defaults__ == (None, isolation.PATIENCE)
 
 
 def test_what_a_controller_leaves_behind_is_ended_but_not_what_is_ours(tmp_path: Path) -> None:
@@ -723,6 +812,39 @@ def test_a_call_that_does_not_come_back_is_ended_and_one_that_goes_on_is_not(mon
     monkeypatch.setattr(isolation, "_ENDING", 0.3)
     with pytest.raises(ControllerFailed, match=r"^--controller c\.so: did not end within 0\.3 s of SIGTERM, in tick "):
         isolated(in_a_call(does_not_hear))
+
+
+def test_guard_and_controller_end_with_who_started_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The guard is also the next parent of what a controller leaves behind."""
+    ask = isolation._prctl
+
+    def noted(option: int, value: int) -> None:
+        with (tmp_path / "asked").open("a") as f:
+            f.write(f"{os.getpid()} {option} {value}\n")
+        ask(option, value)
+
+    monkeypatch.setattr(isolation, "_prctl", noted)
+    guard, child = isolated(lambda: (os.getppid(), os.getpid()))
+    asked = [tuple(map(int, line.split())) for line in (tmp_path / "asked").read_text().splitlines()]
+    assert sorted(asked) == sorted([(guard, 1, signal.SIGKILL), (guard, 36, 1), (child, 1, signal.SIGKILL)])
+
+
+def test_a_task_may_be_isolated_where_ends_of_processes_are_ignored() -> None:
+    before = signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    try:
+        assert isolated(lambda: 5) == 5
+    finally:
+        signal.signal(signal.SIGCHLD, before)
+
+
+def test_nothing_stays_open_of_a_controller_or_of_its_process(good: str) -> None:
+    mine = readable(CAL)
+    before = len(os.listdir("/proc/self/fd"))
+    foreign = Program(good).start(mine)
+    isolated(lambda: 5)
+    with pytest.raises(ControllerFailed):
+        isolated(lambda: os._exit(3))
+    assert len(os.listdir("/proc/self/fd")) == before and foreign.at_fed
 
 
 def test_a_task_may_be_isolated_from_any_thread() -> None:

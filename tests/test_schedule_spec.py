@@ -252,6 +252,17 @@ def test_an_angle_may_follow_the_stroke_by_two_fifths_to_five_halves(times: floa
         measured_loop._right_way(x, times * 1.2 * x, grid, 1.2 * grid, "vigv", "log")
 
 
+def test_strokes_in_three_places_tell_a_wrong_sign_and_in_two_do_not() -> None:
+    grid = np.linspace(0.0, 48.0, 97)
+    three = np.repeat([5.0, 6.5, 40.0], 50)  # the first two in the first two of 24 parts
+    with pytest.raises(LogError, match=r"allowed: 0.4 to 2.5 times that"):
+        measured_loop._right_way(three, -1.2 * three, grid, 1.2 * grid, "vigv", "log")
+    two = np.repeat([5.0, 40.0], 50)
+    measured_loop._right_way(two, -1.2 * two, grid, 1.2 * grid, "vigv", "log")
+    with pytest.raises(LogError, match=r"log: vigv stays at 3 deg while x_lvdt moves from 5 to 40 mm"):
+        measured_loop._right_way(two, np.full(100, 3.0), grid, 1.2 * grid, "vigv", "log")
+
+
 def test_a_curve_is_made_to_rise() -> None:
     y = measured_loop._rising(np.array([1.0, 3.0, 2.0, 2.5, 4.0]))
     assert (np.diff(y) > 0.0).all() and y == pytest.approx([1.0, 3.0, 3.0, 3.0, 4.0], abs=1e-8)
@@ -954,6 +965,19 @@ def test_motions_below_the_threshold_do_not_count() -> None:
     assert of([0.0, 2.0, 1.6, 3.0]) == (3.0, 0.0)  # 0.4 back is no motion
     assert of([0.0, 2.0, 1.0, 3.0]) == (5.0, 2.0)
     assert of([0.0, -2.0, -1.0, -1.5]) == (3.0, 1.0)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_the_first_motion_of_a_run_is_no_reversal(way: float) -> None:
+    """Whichever way it goes, and in however many parts the ticks come."""
+    recorder: Any = object.__new__(st._Recorder)
+    recorder.kept, recorder.x, recorder.current, recorder.rows = [0], 0, 1, []
+    recorder.total, recorder.start, recorder.square, recorder.ticks = np.zeros(2), np.full(3, np.nan), 0.0, 0
+    x = 0.02 + way * 1e-3 * np.r_[np.linspace(0.0, 5.0, 40), np.linspace(5.0, 2.0, 40)]
+    for part in np.split(np.column_stack([x, np.full(80, 2.0)]), 4):
+        recorder(part)
+    assert recorder.total[1] == 1.0 and recorder.total[0] == pytest.approx(5e-3)
+    assert (recorder.square, recorder.ticks) == (320.0, 80) and [len(r) for r in recorder.rows] == [2] * 4
 
 
 def test_errors_near_full_speed_are_those_between_99_and_100() -> None:

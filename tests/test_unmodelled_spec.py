@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.small_logs import white
 from vaneloop import InputError, Record, System, unknown
 from vaneloop.base.curve import FINE
 from vaneloop.base.forms import FORMS
@@ -78,10 +79,6 @@ from vaneloop.identification.user_models.terms import COLUMN, INPUT, OUTPUT
 
 T = 0.1 * np.arange(240)
 U = 1.5 * np.sin(0.9 * T) + 0.7 * np.sin(2.3 * T + 1.0)
-
-
-def white(seed: int, *shape: int) -> Array:
-    return np.random.default_rng(seed).standard_normal(shape)
 
 
 def gain(u: Any, p: Any) -> Any:

@@ -1198,7 +1198,11 @@ def extending(monkeypatch: pytest.MonkeyPatch) -> Any:
         not_observed: Any
         notes: Any = ("n",)
         whole: Any = None
-        plant: Any = field(default_factory=lambda: SimpleNamespace(kind="hydraulic", sides=1))
+        plant: Any = field(
+            default_factory=lambda: SimpleNamespace(
+                kind="hydraulic", sides=1, lacks=lambda effect: "" if "hydraulic" in effect.kinds else "is of motors"
+            )
+        )
         start: float = 10.0
 
         def stage(self, name: str) -> Any:
@@ -1229,13 +1233,55 @@ def test_effects_are_fitted_in_the_stage_that_shows_them_most_clearly(monkeypatc
     assert said.diagnosis.notes[-1] == told and said.diagnosis.stages[0].onset == Onset(15.0, 14.0, 16.0)
 
 
+def test_effects_of_a_subsystem_stay_in_the_order_in_which_they_were_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    chain, _ = extending(monkeypatch)
+    for asked in (["lvdt_bias", "pot_bias"], ["pot_bias", "lvdt_bias"], ["linkage_wear", "lvdt_bias", "pot_bias"]):
+        (shown,) = search.extended(chain, asked, Model(), "a.csv").diagnosis.stages
+        assert (shown.stage, list(shown.names)) == ("linkage", asked)  # the first is shown by two subsystems
+
+
+def two_sides(sides: int = 2, one_valve: bool = False) -> Any:
+    """Subsystems of a machine with so many actuators, and the effects that each may have."""
+    of = {"actuator_a": ["side_a.lvdt_bias"], "actuator_b": ["side_b.lvdt_bias", "aero_load"], "linkage": ["pot_bias"]}
+    stages = [
+        SimpleNamespace(name=n, effects=[SimpleNamespace(name=e) for e in names], index=lambda names=names: names)
+        for n, names in of.items()
+    ]
+    plant = SimpleNamespace(sides=sides, one_valve=one_valve)
+    return SimpleNamespace(stages=stages, plant=plant, not_observed={"engine": "no n_r", "actuator_c": "nothing"})
+
+
+@pytest.mark.parametrize(("name", "forms", "shown"), [
+    ("side_a.lvdt_bias", ("side_a.lvdt_bias",), ("actuator_a", "actuator_c")),
+    ("lvdt_bias", ("side_a.lvdt_bias", "side_b.lvdt_bias"), ("actuator_c",)),
+    ("pot_bias", ("pot_bias",), ("linkage",)), ("aero_load", ("aero_load",), ("actuator_b", "actuator_c")),
+    ("rotor_lag_error", ("rotor_lag_error",), ("engine",)),
+])  # fmt: skip
+def test_an_effect_is_of_the_side_that_has_it(name: str, forms: tuple[str, ...], shown: tuple[str, ...]) -> None:
+    assert search._forms(name, two_sides()) == forms and search._forms(name, two_sides(1)) == (name,)
+    assert search._shown_by(name, two_sides()) == shown
+    if "." not in name:
+        assert search._shown_by(name, two_sides(1)) == search.EFFECTS[name].stages
+
+
+@pytest.mark.parametrize(("name", "sides", "one_valve"), [
+    ("side_a.lvdt_bias", 1, False), ("side_a.pot_bias", 2, False), ("side_b.valve_lag", 2, True),
+])  # fmt: skip
+def test_what_is_of_no_side_of_this_machine_is_refused(name: str, sides: int, one_valve: bool) -> None:
+    with pytest.raises(InputError) as e:
+        search._shown_by(name, two_sides(sides, one_valve))
+    assert str(e.value) == (
+        f"--effect {name}: {name.partition('.')[2]} is not of one of two actuators of this machine (docs/machines.md)"
+    )
+
+
 def test_what_the_log_does_not_show_cannot_be_fitted(monkeypatch: pytest.MonkeyPatch) -> None:
     chain, _ = extending(monkeypatch)
     with pytest.raises(
         InputError, match=r"a.csv: --effect rotor_lag_error: the log does not show its subsystem .engine: no n_r"
     ):
         search.extended(chain, ["rotor_lag_error"], Model(), "a.csv")
-    with pytest.raises(InputError, match="--effect gear_backlash: not of an actuator of kind hydraulic"):
+    with pytest.raises(InputError, match="--effect gear_backlash: is of motors .docs/effects.md"):
         search.extended(chain, ["gear_backlash"], Model(), "a.csv")
     curve = CURVE.model_copy(update={"at": "engine.demand"})
     with pytest.raises(InputError, match=r"--effect bend: the log does not show its subsystem .engine: no n_r"):

@@ -14,6 +14,8 @@ from collections import Counter
 from fnmatch import fnmatch
 from pathlib import Path
 
+from numba.core import config
+
 from vaneloop.identification import settings
 
 from .campaign import ROOT, SETTINGS, Outcome, Target, run_target, sample
@@ -117,28 +119,32 @@ NEAREST = {
     ),
     "hil.bus": "bus_spec bus_port_spec bus_lockstep_spec bus frames wire loop moments realtime node uds secoc",
     "hil.logs": (
-        "logs logs_frames_spec logs_names_spec logs_record_spec logs_tables_spec loggers reading readings guess held "
-        "record logs_fuzz formulas field_traces tables_of_the_field transport log_formats recorders dataframes child"
+        "logs logs_frames_spec logs_names_spec logs_others_spec logs_parts_spec logs_reading_spec logs_record_spec "
+        "logs_recorded_spec logs_tables_spec loggers reading readings guess held record logs_fuzz formulas "
+        "formulas_spec field_traces tables_of_the_field transport log_formats recorders dataframes child"
     ),
     "hil.native": "native_spec native c_reference xcp",
     "hil.loop": (
-        "loop_spec loop lanes lockstep node secoc realtime moments replay native machines frames strategies "
-        "scenarios_in_lanes gpu channels two_actuators"
+        "loop_spec loop_parts_spec loop lanes lockstep node secoc realtime moments replay native machines frames "
+        "strategies scenarios_in_lanes gpu channels two_actuators"
     ),
     "hil.fmu": "fmu_spec fmu",
     "hil.calibrate": "xcp uds xcp_spec tool_states",
     "hil.uds": "uds uds_spec tool_states",
-    "hil.inject": "inject fuzz campaign loop moments inject_spec fuzz_spec scenarios_in_lanes gpu tool_states native",
+    "hil.inject": (
+        "inject fuzz campaign loop moments inject_spec inject_parts_spec fuzz_spec scenarios_in_lanes gpu tool_states "
+        "native"
+    ),
     "vaneloop": "verbs",
     "vaneloop.base": (
-        "base_spec files streams lean tables kept parts held machines identification learn_surfaces learn_turns "
-        "learn_stops exit_codes your_own_model verbs help curve_lanes cells child sizes plant_spec"
+        "base_spec tables_spec files streams lean tables kept parts held machines identification learn_surfaces "
+        "learn_turns learn_stops exit_codes your_own_model verbs help curve_lanes cells child sizes plant_spec"
     ),
     **dict.fromkeys(
         CORE,
-        "selection_spec search_spec least_squares_spec regimes_spec answer_spec candidates_spec onset identification "
-        "rules descent never_worse finite trust latest laws names search_limits search_ahead promise directions rivals "
-        "curves readings held long_logs doubts learn_slopes same_answer",
+        "selection_spec search_spec acceptance_spec least_squares_spec descent_steps_spec regimes_spec answer_spec "
+        "candidates_spec onset identification rules descent never_worse finite trust latest laws names search_limits "
+        "search_ahead promise directions rivals curves readings held long_logs doubts learn_slopes same_answer",
     ),
     "vaneloop.identification.candidates": (
         "candidates_spec laws own_laws curves curves_of_nobody hidden_law learn learn_band learn_confirmed "
@@ -146,16 +152,17 @@ NEAREST = {
     ),
     **dict.fromkeys(
         OWN_MODELS,
-        "user_models_spec unmodelled_spec curve_choice_spec curves_in_place_spec experiment_own laws own_laws "
-        "hidden_law learn learn_beside learn_confirmed "
+        "user_models_spec model_warnings_spec unmodelled_spec curve_choice_spec curves_in_place_spec curve_search_spec "
+        "experiment_own laws own_laws hidden_law learn learn_beside learn_confirmed "
         "learn_creep learn_differences learn_faint learn_followers learn_lags learn_periods learn_screening "
         "learn_slopes learn_speed learn_stops learn_surfaces learn_turns learn_two learn_vanes promise spikes "
         "starts your_own_model kept held",
     ),
     "vaneloop.identification.vane_chain": (
-        "vane_chain_spec recorders hum stationary_noise late_channels same_answer learn_vanes learn_lags learn_stops "
-        "learn_followers learn_faint learn_screening held loggers long_logs identification curves directions "
-        "electromechanical readings two_actuators onset"
+        "vane_chain_spec vane_chain_clocks_spec vane_chain_noise_spec vane_chain_parts_spec vane_chain_search_spec "
+        "recorders hum stationary_noise late_channels same_answer learn_vanes learn_lags learn_stops learn_followers "
+        "learn_faint learn_screening held loggers long_logs identification curves directions electromechanical "
+        "readings two_actuators onset"
     ),
     "vaneloop.design": "design_spec schedule_spec design schedule spatial strategies tables tolerances",
     "vaneloop.fleet": (
@@ -196,7 +203,7 @@ TARGETS += (Target("hil.loop.cuda", ("hil/loop/cuda.py",), ("tests/test_gpu.py",
 KERNELS = {
     "plant": "plant effects_reference linkage electromechanical tables curve_lanes",
     "plant.stages": "curve_lanes effects_reference same_answer electromechanical",
-    "hil.loop": "loop_spec loop lanes lockstep node moments",
+    "hil.loop": "loop_spec loop_parts_spec loop lanes lockstep node moments",
     "vaneloop.base": "tables learn_surfaces learn_stops your_own_model",
     "vaneloop.design": "design_spec schedule_spec design schedule",
     **dict.fromkeys(CORE, "laws identification names search_limits promise trust"),
@@ -241,6 +248,10 @@ def apart(target: Target, chosen: list[Mutant], jobs: int, reasons: dict[str, st
         code = 2
         try:
             os.environ["NUMBA_DISABLE_JIT"] = "0" if target.compiled else "1"
+            folder = config.CACHE_DIR  # type: ignore[attr-defined]
+            # else the first test that compiles reads it, and forgets the folder
+            config.reload_config()  # type: ignore[no-untyped-call]
+            config.CACHE_DIR = folder  # type: ignore[attr-defined]
 
             def say(o: Outcome) -> None:
                 if verbose and o.by:

@@ -520,7 +520,11 @@ class _Child:
 def _failure(item: pytest.Item, following: pytest.Item | None) -> str:
     from _pytest.runner import runtestprotocol
 
-    for report in runtestprotocol(item, log=False, nextitem=following):
+    try:
+        reports = runtestprotocol(item, log=False, nextitem=following)
+    except KeyboardInterrupt:  # pytest passes it on; here only the test itself can have raised it
+        return f"{item.nodeid}: KeyboardInterrupt"
+    for report in reports:
         if report.failed:
             return f"{item.nodeid}: {str(report.longrepr).strip().splitlines()[-1]}"
     return ""

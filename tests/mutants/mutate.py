@@ -208,8 +208,6 @@ def _text(s: ast.stmt) -> str:
         return f"for {ast.unparse(s.target)} in {ast.unparse(s.iter)}"
     if isinstance(s, ast.With):
         return "with " + ", ".join(ast.unparse(i) for i in s.items)
-    if isinstance(s, ast.Assign) and isinstance(s.value, ast.Call) and ast.unparse(s.value.func) == "setting":
-        return f"{ast.unparse(s.targets[0])} = {ast.unparse(s.value.args[0])}"  # a threshold without what is said of it
     return ast.unparse(s)
 
 
