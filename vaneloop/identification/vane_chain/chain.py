@@ -174,24 +174,29 @@ def build_chain(
     chain = _build(log, plant, calibration, present, grid, pieces, draws, known)
     known_clocks = late is not None or framed or chain.plant.sides > 1
     noisy = expect_stationary_noise(chain.stages) if known_clocks else []
-    steps, once_more = [] if known_clocks else [zeros_in_controller, late_in_controller, late_vanes], True
-    while steps:
-        find = steps.pop(0)
+
+    def moved(find: Callable[[Sequence[Stage]], LateIn], clocks: bool = True) -> bool:
+        """Whether ``find`` finds something in the stages; the chain is then made anew with it, and with the clocks that
+        were found before or without those.
+        """
+        nonlocal chain, known, noisy
         found = find(chain.stages)
-        if found and find is late_in_controller and once_more:  # clocks may have hidden a zero
-            once_more = False
-            steps.insert(0, zeros_in_controller)
-        if found and find is zeros_in_controller and known:  # and were then read off channels with a wrong one
-            known = {name: tuple(one for one in all_of if one.zero) for name, all_of in known.items()}
-            steps.insert(0, late_in_controller)
         if found:
-            known = {**known, **{name: known.get(name, ()) + more for name, more in found.items()}}
+            kept = {name: tuple(one for one in all_of if clocks or one.zero) for name, all_of in known.items()}
+            known = {**kept, **{name: kept.get(name, ()) + more for name, more in found.items()}}
             hidden = {s.name: s.raster_error for s in chain.stages}
             chain = _build(log, plant, calibration, present, grid, pieces, draws, known)
             for stage in chain.stages:
                 _hides_no_less(stage, hidden.get(stage.name))
         if found or find is late_in_controller:
             noisy = expect_stationary_noise(chain.stages)
+        return bool(found)
+
+    if not known_clocks:
+        moved(zeros_in_controller)
+        if moved(late_in_controller) and moved(zeros_in_controller, clocks=False):
+            moved(late_in_controller)  # clocks had hidden a zero, and were read off channels with a wrong one
+        moved(late_vanes)
     chain.notes += _moved(known) + noisy + _one_stroke(log, chain.plant) + swapped(chain.stages)
     chain.late = known
     return chain
