@@ -255,6 +255,18 @@ class Model(Table):
         lines = [*(history if isinstance(history, list) else [str(history)]), command]
         return self.model_copy(update={"meta": {**self.meta, "history": lines}})
 
+    @classmethod
+    def of_effects(cls, effects: Mapping[str, Mapping[str, float]]) -> Model:
+        """A model of these effects alone, with their parameters: of the machine, or as ``side_b.lvdt_bias`` of one of
+        two actuators.
+        """
+        of: dict[str, dict[str, dict[str, float]]] = {name: {} for name in ("", *SIDE_NAMES)}
+        for name, parameters in effects.items():
+            side, effect = side_of(name)
+            of[side][effect] = dict(parameters)
+        a, b = (Side(effects=of[side]) for side in SIDE_NAMES)
+        return cls(effects=of[""], side_a=a, side_b=b)
+
     @property
     def sides(self) -> dict[str, Side]:
         """What one of two actuators has that both have not, of those that have such a thing; side A's first."""

@@ -31,8 +31,10 @@ from vaneloop.cli.main import main
 from vaneloop.identification import workflow
 from vaneloop.identification.results import Found
 from vaneloop.identification.subsystem import Stage
+from vaneloop.identification.vane_chain import experiment
 from vaneloop.identification.vane_chain.candidates import without_laws
 from vaneloop.identification.vane_chain.chain import Chain, build_chain
+from vaneloop.identification.vane_chain.experiment import divergence
 from vaneloop.identification.workflow import diagnose, locate_stages
 from vaneloop.verbs.search import extended, known
 
@@ -361,3 +363,36 @@ def test_a_side_without_an_effect_of_the_library_is_unknown() -> None:
     known(["side_b.lvdt_bias", "lvdt_bias"])
     with pytest.raises(InputError, match=r"'side_b\.lvdt_bia' is not in the library"):
         known(["side_b.lvdt_bia"])
+
+
+@pytest.mark.slow
+def test_a_run_is_simulated_with_what_one_side_has_and_its_rival_is_refitted_at_that_side() -> None:
+    profile = np.interp(np.arange(0.0, 40.0, 0.01), [5.0, 10.0, 20.0, 25.0, 35.0], [60.0, 95.0, 95.0, 60.0, 60.0])
+    for truth, named, rival in (
+        ({"side_b.lvdt_bias": BIAS["lvdt_bias"]}, "side_b.lvdt_bias", "side_b.piston_friction"),
+        (FRICTION, "piston_friction", "side_b.lvdt_bias"),
+    ):
+        nats, spreads = divergence(profile, truth, "actuator_b", rival, named, plant=TWO)
+        assert nats > 500.0 and spreads > 3.0, named
+
+
+def test_the_machine_of_a_next_run_has_an_effect_and_not_its_rival(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two that one log cannot tell apart either subsystem may name the other."""
+    seen: list[object] = []
+    monkeypatch.setattr(experiment, "profiles", lambda: {"one": np.zeros(10)})
+
+    def divergence(profile: object, truth: object, *names: object) -> tuple[float, float]:
+        seen.append((truth, names))
+        return 1.0, 1.0
+
+    monkeypatch.setattr(experiment, "divergence", divergence)
+    bias, length = ("side_b.lvdt_bias", "bias", 0.5), ("side_b.rigging_offset", "length", 0.25)
+    stages = [
+        SimpleNamespace(stage=stage, effects=[SimpleNamespace(effect=e, rivals=[r[0]], parameters={n: {"value": v}})])
+        for stage, (e, n, v), r in (("actuator_a", length, bias), ("actuator_b", bias, length))
+    ]
+    assert experiment.recommend(SimpleNamespace(stages=stages)) is not None
+    assert seen == [
+        ({e: {n: v}}, (stage, rival, e, ()))
+        for stage, (e, n, v), (rival, *_) in (("actuator_a", length, bias), ("actuator_b", bias, length))
+    ]

@@ -62,7 +62,7 @@ def command(args: argparse.Namespace) -> int:
         for name in ("limit", "rate", "seconds"):
             if getattr(args, name):
                 raise InputError(f"--{name} needs --system MY.py")
-        chain = chain_of(args, loop=True, alone="an experiment")
+        chain = chain_of(args, loop=True)
         with options.search_bar(args) as news:
             found = diagnosed(chain, args.log, news=news)
         with terminal.progress_bar(args, "trying profiles") as progress:

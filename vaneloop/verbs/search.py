@@ -817,9 +817,7 @@ def experiment(
     if isinstance(model, System):
         model = diagnose(log, model, fit=fit, test=test, added=added, progress=lambda f: tell(0.3 * f))
     elif not isinstance(model, Diagnosed):
-        machine = model or Machine()
-        machine.plant.of_one_actuator("an experiment")
-        model = diagnosed(*chain_for(cast("LogLike", log), machine, fit, test))
+        model = diagnosed(*chain_for(cast("LogLike", log), model or Machine(), fit, test))
     if model.by_log is None:
         best = recommend(model.diagnosis, progress, model.bound)
     else:

@@ -5,6 +5,7 @@ profiles.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from hil.logs import Channel, Log
 from hil.loop.lockstep import Stimulus, lockstep
 from plant import Model, build_plant
 from plant.effects import EFFECTS
+from plant.model import side_of
 from vaneloop.identification.least_squares.noise import correlation_of
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.selection.diagnosis import floor_of
@@ -22,6 +24,7 @@ from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAc
 from vaneloop.identification.selection.rules import gain
 from vaneloop.identification.selection.search import Search
 from vaneloop.identification.settings import MARGIN, MOST_REPEATS, NATS, RIVAL_SPREADS
+from vaneloop.identification.subsystem import Stage
 from vaneloop.identification.vane_chain.chain import build_chain
 
 if TYPE_CHECKING:
@@ -88,7 +91,8 @@ def divergence(
     """How much better the effect ``named`` explains a simulated run than ``rival`` does, both refitted, on this
     profile.
 
-    truth   effects of the simulated machine with their parameters (border units)
+    truth   effects of the simulated machine with their parameters (border units); those of one of two actuators as
+            ``side_b.lvdt_bias``
     beside  other effects of the stage, refitted together with either
     plant, calibration  the machine without these effects; default: the shipped tables
 
@@ -100,7 +104,7 @@ def divergence(
     run = lockstep(
         Stimulus.of(profile, t_oil=warm),
         calibration=calibration,
-        plant=Model(effects=truth).plant(machine),
+        plant=Model.of_effects(truth).plant(machine),
         seed=seed,
         hashed=False,
     )
@@ -112,7 +116,8 @@ def divergence(
         return 0.0, 0.0
     s = chain.stage(stage)
     # only these effects are needed: fewer columns, the same run
-    needed = (rival, named, *beside)
+    needed = tuple(_of_stage(s, name) for name in (rival, named, *beside))
+    rival, named, *others = needed
     full, keep, neutral = s.run, _columns(s, needed), s.neutral()
     s.effects = tuple(e for e in s.effects if e.name in needed)
 
@@ -124,11 +129,17 @@ def divergence(
     s.run = reduced
     judge = LeastSquaresProblem(s, floor_of(s))
     search = Search(LikelihoodAcceptance(judge))
-    best, other = (search.joined((*beside, name)) for name in (named, rival))
+    best, other = (search.joined((*others, name)) for name in (named, rival))
     return gain(other, best, correlation_of(judge, best))
 
 
-def _columns(stage: Any, effects: tuple[str, ...]) -> list[int]:
+def _of_stage(stage: Stage, name: str) -> str:
+    """The name by which a stage has an effect: where both actuators have it, its own side's, or else side A's."""
+    own = f"side_{stage.name[-1]}.{name}"
+    return next(e for e in (name, own, f"side_a.{name}") if e in {x.name for x in stage.effects})
+
+
+def _columns(stage: Stage, effects: Sequence[str]) -> list[int]:
     index = stage.index()
     out = list(range(len(stage.parameters)))
     for e in stage.effects:
@@ -154,11 +165,12 @@ def recommend(d: Any, progress: Any = None, chain: Any = None) -> dict[str, Any]
     scores: dict[str, list[tuple[float, float]]] = {name: [] for name in bank}
     truth: dict[str, dict[str, float]] = {}  # an effect that shows in two stages was fitted in both; the first will do
     for f in (f for s in d.stages for f in s.effects):
-        known = [p.name for p in EFFECTS[f.effect].parameters]
+        known = [p.name for p in EFFECTS[side_of(f.effect)[1]].parameters]
         truth.setdefault(f.effect, {k: float(v["value"]) for k, v in f.parameters.items() if k in known})
     for i, ((name, profile), (s, f, rival)) in enumerate(jobs):
         beside = tuple(o.effect for o in s.effects if o.effect not in (f.effect, rival))
-        scores[name].append(divergence(profile, truth, s.stage, rival, f.effect, beside, **machine))
+        without = {k: v for k, v in truth.items() if k != rival}  # which another stage may name
+        scores[name].append(divergence(profile, without, s.stage, rival, f.effect, beside, **machine))
         if progress:
             progress((i + 1) / len(jobs))
     for name, found in scores.items():
