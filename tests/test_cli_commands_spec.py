@@ -972,7 +972,7 @@ def test_a_fleet_is_begun_worked_on_and_reported(ran: Ran, log: str, monkeypatch
     assert ran("fleet", "run", log, "--out", "RUN", "--system", "own.py", "--quiet") == 0
     for words in (["--workers", "0"], ["--workers", "10001"], ["--limit", "0"], ["--limit", "1.1e6"], ["--on", "moon"],
                   ["--system", "own.py", "--plant", "p.toml"], ["--system", "no.py"], ["--patience", "0.4"],
-                  ["--queue", "x"], ["--plant", "plant_two_actuators.toml"]):  # fmt: skip
+                  ["--queue", "x"], ["--plant", "p.toml"]):  # fmt: skip
         assert ran("fleet", "run", log, "--out", "RUN", *words) == 2
     monkeypatch.setattr(fleet, "work", lambda run, **more: asked.append(("work", run, more)) or {"done": 3, "died": 1})
     assert ran("fleet", "work", "RUN", "--trust", "--patience", "6") == 0 and ran("fleet", "work", "RUN") == 2

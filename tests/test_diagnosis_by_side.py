@@ -27,7 +27,9 @@ from plant.places import X
 from plant.stages import ring_loads
 from vaneloop import Machine
 from vaneloop.base.errors import InputError
+from vaneloop.base.tables import file_of
 from vaneloop.cli.main import main
+from vaneloop.fleet.diagnosis import diagnose_log
 from vaneloop.identification import workflow
 from vaneloop.identification.results import Found
 from vaneloop.identification.subsystem import Stage
@@ -396,3 +398,17 @@ def test_the_machine_of_a_next_run_has_an_effect_and_not_its_rival(monkeypatch: 
         ({e: {n: v}}, (stage, rival, e, ()))
         for stage, (e, n, v), (rival, *_) in (("actuator_a", length, bias), ("actuator_b", bias, length))
     ]
+
+
+@pytest.mark.slow
+def test_a_fleet_has_the_size_that_each_side_of_its_machine_has(tmp_path: Path) -> None:
+    pytest.importorskip("psutil", reason="the extra `fleet` is not installed")
+    plant = {"files": {"plant": str(file_of(TABLE).resolve())}, "reading": {}}
+    for name, model in (("both", Model(effects=FRICTION)), ("b", Model(side_b=Side(effects=FRICTION)))):
+        write_log(tmp_path / f"{name}.parquet", logged(model).channels)
+        answer = diagnose_log(str(tmp_path / f"{name}.parquet"), plant, str(tmp_path))["answer"]
+        ((effect, stage, value),) = ((row["effect"], row["stage"], row["value"]) for row in answer["sizes"])
+        assert effect == ("piston_friction" if name == "both" else "side_b.piston_friction")
+        assert stage == "actuator_b" or name == "both"
+        assert value == pytest.approx(1500.0, rel=0.2)
+        assert {row["stage"] for row in answer["nominal"]} >= {"actuator_b"}

@@ -468,6 +468,7 @@ WORKS = {  # what it does with two actuators
     "locate": (LOG,),
     "diagnose": (LOG,),
     "experiment": (LOG,),
+    "fleet": ("run", LOG, "--out", "run"),
     "extend": (LOG, "--effect", "linkage_backlash", "--out", "x.toml"),
     "run": SHORT,
     "inject": ("demand_stops",),
@@ -476,13 +477,7 @@ WORKS = {  # what it does with two actuators
     "ecu": (),  # of the machine only the engine
     "a2l": (),  # of the firmware
 }
-REFUSED = {
-    "learn": (LOG,),
-    "design": (),
-    "export-fmu": ("--part", "plant", "--out", "x.fmu"),
-    "fleet": ("run", LOG, "--out", "run"),
-    "web": ("--no-open",),
-}
+REFUSED = {"learn": (LOG,), "design": (), "export-fmu": ("--part", "plant", "--out", "x.fmu"), "web": ("--no-open",)}
 
 
 def takes_a_plant(parser: argparse.ArgumentParser) -> bool:
