@@ -216,8 +216,10 @@ class Stage:
         return np.array([p.expected for p in self.all_parameters()], dtype=float)
 
     def effect(self, name: str) -> Effect:
-        """Return the effect of that name, or of that family the first."""
-        return next(e for named in ("name", "family") for e in self.effects if getattr(e, named) == name)
+        """Return the effect of that name, or of that family the first; an effect of both actuators stands before that
+        of either.
+        """
+        return next(e for e in self.effects if name in (e.name, e.family))
 
 
 class Bound(Protocol):

@@ -116,7 +116,7 @@ def divergence(
         return 0.0, 0.0
     s = chain.stage(stage)
     # only these effects are needed: fewer columns, the same run
-    needed = tuple(_of_stage(s, name) for name in (rival, named, *beside))
+    needed = tuple(s.effect(name).name for name in (rival, named, *beside))
     rival, named, *others = needed
     full, keep, neutral = s.run, _columns(s, needed), s.neutral()
     s.effects = tuple(e for e in s.effects if e.name in needed)
@@ -131,12 +131,6 @@ def divergence(
     search = Search(LikelihoodAcceptance(judge))
     best, other = (search.joined((*others, name)) for name in (named, rival))
     return gain(other, best, correlation_of(judge, best))
-
-
-def _of_stage(stage: Stage, name: str) -> str:
-    """The name by which a stage has an effect: where both actuators have it, its own side's, or else side A's."""
-    own = f"side_{stage.name[-1]}.{name}"
-    return next(e for e in (name, own, f"side_a.{name}") if e in {x.name for x in stage.effects})
 
 
 def _columns(stage: Stage, effects: Sequence[str]) -> list[int]:
