@@ -393,7 +393,9 @@ def test_the_machine_of_a_next_run_has_an_effect_and_not_its_rival(monkeypatch: 
         SimpleNamespace(stage=stage, effects=[SimpleNamespace(effect=e, rivals=[r[0]], parameters={n: {"value": v}})])
         for stage, (e, n, v), r in (("actuator_a", length, bias), ("actuator_b", bias, length))
     ]
-    assert experiment.recommend(SimpleNamespace(stages=stages)) is not None
+    got = experiment.recommend(SimpleNamespace(stages=stages))
+    assert got is not None and "To distinguish" not in got["text"]  # one nat is too few
+    assert "separates side_b.lvdt_bias from side_b.rigging_offset, even" in got["text"]  # a pair is said once
     assert seen == [
         ({e: {n: v}}, (stage, rival, e, ()))
         for stage, (e, n, v), (rival, *_) in (("actuator_a", length, bias), ("actuator_b", bias, length))

@@ -183,7 +183,8 @@ def recommend(d: Any, progress: Any = None, chain: Any = None) -> dict[str, Any]
     repeats = max(1, best["repeats"])
     profile = np.tile(once, repeats)
     separated = best["repeats"] > 0
-    names = ", ".join(f"{f.effect} from {r}" for _, f, r in pairs)
+    apart = {frozenset(pair): pair for pair in ((f.effect, r) for _, f, r in pairs)}  # one that two stages have is one
+    names = ", ".join(f"{effect} from {rival}" for effect, rival in apart.values())
     often = "" if repeats == 1 else f", {repeats} times over"
     gained = repeats * best["nats"]
     text = (
