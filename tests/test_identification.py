@@ -542,7 +542,9 @@ def test_what_is_quieter_than_the_model_s_error_is_the_noise() -> None:
 
 
 def test_a_floor_is_raised_to_what_an_effect_hides_between_two_rows_and_only_then() -> None:
-    stage = replace(integrator(2, dead_band=0.6), hidden=lambda theta: np.array([0.03]))
+    stage = integrator(2, dead_band=0.6)
+    at = stage.index()["dead_band"].start
+    stage = replace(stage, hidden=lambda theta: np.array([0.03 if theta[at] else 0.0]))
     with_it = stage.neutral()
     assert reach_of(stage, FLOOR, with_it)[0] == NOISE
     with_it[stage.index()["dead_band"]] = 0.6

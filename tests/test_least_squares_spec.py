@@ -417,6 +417,11 @@ def test_what_happens_between_two_rows_raises_the_reach_where_an_effect_is_there
     stage.hidden = lambda theta: np.array([0.3 * abs(theta[1]), 1e-6])
     assert reach_of(stage, FLOOR, np.array([3.0, 0.0, 0.0])) is FLOOR  # the model's own parameter is no effect
     assert reach_of(stage, FLOOR, np.array([1.0, 2.0, 0.0])) == pytest.approx([np.hypot(0.1, 0.6), 0.3])
+    stage.hidden = lambda theta: np.hypot(0.08, [0.3 * theta[1], -0.06 * theta[1]])  # the floor holds the nominal part
+    assert reach_of(stage, FLOOR, np.array([1.0, 2.0, 0.0])) == pytest.approx(np.hypot(FLOOR, [0.6, 0.12]))
+    stage.hidden = lambda theta: np.array([0.08, 0.08]) if theta[1] else np.array([0.09, 0.09])
+    assert reach_of(stage, FLOOR, np.array([1.0, 2.0, 0.0])) is not None
+    assert np.array_equal(reach_of(stage, FLOOR, np.array([1.0, 2.0, 0.0])), FLOOR)  # never below it
 
 
 # ---- stages ----------------------------------------------------------------------------------------------------------

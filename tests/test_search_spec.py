@@ -427,7 +427,7 @@ def test_a_model_is_asked_again_where_the_noise_was_lower() -> None:
     assert diagnosis._down_to(stage, np.array([1.0]), ask) == 1
     stage.noise = None
     told.clear()
-    stage.hidden = lambda theta: np.array([2.0])
+    stage.hidden = lambda theta: np.array([2.0 * theta[1]])
     fit.theta = stage.neutral() + np.array([0.0, 1.0, 0.0, 0.0])
     assert diagnosis._down_to(stage, np.array([1.0]), ask) == 2
     assert told == [(1.0, False), (pytest.approx(np.hypot(1.0, 2.0)), True)]
@@ -920,7 +920,8 @@ def test_the_last_word_is_asked_where_nobody_can_come_closer(monkeypatch: pytest
     """What effects make of what happens between two rows lifts the floor; it is then known to five per cent."""
     x = signals(33)
     stage = linear(x, with_noise(33, x, 1.1, 2.0))
-    stage.hidden = lambda theta: np.array([0.5])
+    neutral = stage.neutral()
+    stage.hidden = lambda theta: np.array([0.5 if np.any(theta[1:] != neutral[1:]) else 0.0])
     known: list[float] = []
     monkeypatch.setattr(
         diagnosis, "searched",

@@ -20,7 +20,7 @@ from tests.rig import Hidden
 from tests.test_recorders import verdicts
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem
 from vaneloop.identification.settings import AGREES
-from vaneloop.identification.subsystem import Array, Parameter, Stage
+from vaneloop.identification.subsystem import Array, Effect, Parameter, Stage
 from vaneloop.identification.vane_chain.chain import build_chain
 from vaneloop.identification.vane_chain.stationary_noise import (
     Expected,
@@ -106,6 +106,27 @@ def test_noise_does_not_follow_the_nominal_parameters_and_play_at_its_limit_does
         left = judge.errors(stage.neutral()[None])[0, 0]
         assert x == pytest.approx((left @ slope[0]) ** 2 / there.sum() / (left @ left)) and y < 0.01
         assert (x > 0.05) == (more > 0.0)
+
+
+@pytest.mark.parametrize(("size", "known"), [(1.0, False), (1.0, True), (0.0, True)])
+def test_what_an_effect_of_the_library_explains_is_no_noise(size: float, known: bool) -> None:
+    """An error that is the same under every condition, as an effect's that turns on none of them, and then it is
+    another's.
+    """
+    law, white = coloured(7), np.random.default_rng(8).standard_normal(ROWS)
+    error = white + size * law + (0.0 if size else coloured(9))
+    effects = (Effect("stray", (Parameter("size", 0.0, "mm", -10.0, 10.0),), ((0.5,), (-0.5,))),) if known else ()
+    regimes = {"time": T, "stroke speed": SPEED, "direction": np.sign(SPEED)}
+    stage = Stage("actuator", ("x_lvdt",), ("mm",), (), effects,
+                  lambda p: (p @ np.ones((p.shape[1], 1)) * law)[:, None], T, error[None], regimes=regimes,
+                  floor=np.ones(1), memory=10.0, noise=lambda when, e: 1.0)  # fmt: skip
+    stage.made = Made(lambda driven: stage, SimpleNamespace(columns={"x_lvdt": error}))  # type: ignore[arg-type]
+    notes = expect_stationary_noise([stage])
+    assert stage.floor is not None
+    if size and known:
+        assert not notes and stage.floor[0] == FLOOR
+    else:
+        assert len(notes) == 1 and stage.floor[0] == pytest.approx(np.sqrt(2.0), rel=0.1)
 
 
 def test_a_drift_in_every_window_is_no_noise() -> None:

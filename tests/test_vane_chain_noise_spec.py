@@ -386,6 +386,8 @@ def test_the_quietest_tenth_of_windows_is_seen_beside_its_trend() -> None:
     assert np.abs(quiet.mean(axis=1)).max() < 1e-9
     assert np.abs(quiet @ np.linspace(-1.0, 1.0, 500)).max() < 1e-6
     assert len(_quietest(windows[:3])) == 1 and len(_quietest(windows[:0])) == 0
+    by = np.where(np.arange(40)[:, None] % 10 == 7, 2.0, np.arange(500.0))  # the demand rests in four of them
+    np.testing.assert_allclose(np.std(_quietest(windows, by), axis=1), sizes[7::10], rtol=0.15)
     assert _power(np.array([[3.0, -1.0]])) == 5.0 and _power(windows[:0]) == np.inf
 
 

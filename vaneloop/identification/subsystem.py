@@ -243,12 +243,14 @@ class Model(Protocol):
 
 
 def reach_of(stage: Stage, floor: Array, theta: Array) -> Array:
-    """How close a model can come to each output: ``floor``, and what the effects in ``theta`` make of what happens
-    between two rows.
+    """How close a model can come to each output: ``floor``, and what the effects in ``theta`` make more of what happens
+    between two rows than the nominal model does, which the floor holds already.
     """
-    if stage.hidden is None or np.array_equal(theta[len(stage.parameters) :], stage.neutral()[len(stage.parameters) :]):
+    neutral = stage.neutral()
+    if stage.hidden is None or np.array_equal(theta[len(stage.parameters) :], neutral[len(stage.parameters) :]):
         return floor
-    return lifted(floor, stage.hidden(theta))
+    more = stage.hidden(theta) ** 2 - stage.hidden(neutral) ** 2
+    return lifted(floor, np.sqrt(np.maximum(more, 0.0)))
 
 
 def lifted(floor: Array, error: Array | float) -> Array:

@@ -8,16 +8,16 @@ What tells it from missing physics: it is the same under every condition. An err
 * no bin has a mean that makes as much of it, or such a slope in the windows whose constant is free,
 * no line of its spectrum does: what swings has a cause,
 * the nominal parameters, beyond their tolerances, would take no more of it than chance allows,
+* no effect of the library explains it: a friction leaves much the same error wherever the piston moves,
 * and the log is long enough to tell: an error found in only half of a condition's bins would fail that test with a
   probability of `NOISE_TOLD`, for at least half of the conditions. Outputs of one subsystem have one recorder: one of
   them has to tell.
 
-Expected is the output's own noise, which is no more than how the output moves where it is quietest, and a share of what
-draws of noise do in a channel that drives the subsystem, which through a table or through play is not alike everywhere;
-what slow rows hide is expected where they hide it.
-The noise of a channel is how it moves where it is quietest, or what the subsystem that explains it leaves, once that is
-known to be noise. So a valve's dead band, whose error is much the same under every condition, is none: its piston
-rests.
+Expected is the output's own noise, which is no more than how the output moves where the demand rests, and a share of
+what draws of noise do in a channel that drives the subsystem, which through a table or through play is not alike
+everywhere; what slow rows hide is expected where they hide it. The noise of a channel is how it moves where the demand
+rests, or what the subsystem that explains it leaves, once that is known to be noise. So a valve's dead band, whose
+error is much the same under every condition, is none: its piston rests.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ import scipy
 
 from vaneloop.identification.least_squares.problem import LeastSquaresProblem, recalibrate
 from vaneloop.identification.regimes import bins_of
+from vaneloop.identification.selection.likelihood_acceptance import LikelihoodAcceptance
+from vaneloop.identification.selection.search import Search
 from vaneloop.identification.settings import (
     AGREES,
     FLOOR_KNOWN,
@@ -74,7 +76,9 @@ def expect_stationary_noise(stages: Sequence[Stage]) -> list[str]:
     noise: dict[str, Array] = {}  # channel -> its noise in windows
     for stage, channel in ((of[name], channel) for name, channel in ORDER.items() if name in of):
         if channel in (columns := stage.made.driven.columns):  # type: ignore[attr-defined]
-            noise[channel] = _quietest(_windows(stage, columns[channel], WINDOW))
+            demand = _demand(columns, channel)
+            seconds = WINDOW if demand is None else NOISE_WINDOW
+            noise[channel] = _quietest(*_windows_of(stage, columns[channel], demand, seconds))
     notes = []
     for stage, through in ((of[name], through) for name, through in ORDER.items() if name in of):
         judge = LeastSquaresProblem(stage, np.asarray(stage.floor))
@@ -87,10 +91,15 @@ def expect_stationary_noise(stages: Sequence[Stage]) -> list[str]:
                 made = np.mean(judge._whiten(judge.measured - draws) ** 2, axis=0) * judge.floor[:, None] ** 2
             columns = stage.made.driven.columns  # type: ignore[attr-defined]
             lost = judge.lost()
-            found = [_noise_in(judge, k, e[k], made[k], columns[o], lost[k]) for k, o in enumerate(stage.outputs)]
+            found = [
+                _noise_in(judge, k, e[k], made[k], columns[o], lost[k], _demand(columns, o))
+                for k, o in enumerate(stage.outputs)
+            ]
             expected = [one for one in found if one is not None]
             told = any(one.told and one.size > seen for one, seen in zip(expected, judge.floor, strict=False))
             if len(expected) < len(found) or not told or np.any(_of_parameters(judge, theta) > NOISE_BY_CHANCE):
+                continue
+            if _explained(judge):
                 continue
             notes += _said(stage, expected, judge.floor)
             _expect(stage, expected, draws)
@@ -115,9 +124,23 @@ def like(windows: Array, samples: int, seed: int) -> Array:
 
 def _windows(stage: Stage, values: Array, seconds: float | None) -> Array:
     """Values in windows of so many seconds without a gap, float64[windows, samples]."""
+    return _windows_of(stage, values, None, seconds)[0]
+
+
+def _windows_of(stage: Stage, values: Array, beside: Array | None, seconds: float | None) -> tuple[Array, Array]:
+    """Values in windows of so many seconds without a gap in them or in another channel, and that channel in the same
+    windows, float64[windows, samples] each; no other channel: the values themselves.
+    """
     width = max(8, round((seconds or NOISE_WINDOW) / float(stage.t[1] - stage.t[0])))
-    whole = values[: len(values) // width * width].reshape(-1, width)
-    return np.asarray(whole[np.isfinite(whole).all(axis=1)])
+    both = np.array([values, values if beside is None else beside])
+    both = both[:, : both.shape[1] // width * width].reshape(2, -1, width)
+    whole, others = both[:, np.isfinite(both).all(axis=(0, 2))]
+    return whole, others
+
+
+def _demand(columns: Mapping[str, Array], channel: str) -> Array | None:
+    """The demand that stroke, current and angles follow; None: of another channel, or not logged."""
+    return None if channel in ("n_r", "x_dem") else columns.get("x_dem")
 
 
 def _draws(stage: Stage, channel: str, windows: Array) -> Array | None:
@@ -143,13 +166,15 @@ def _draws(stage: Stage, channel: str, windows: Array) -> Array | None:
 
 
 def _noise_in(
-    judge: LeastSquaresProblem, k: int, error: Array, made: Array, output: Array, lost: Array
-) -> Expected | None:
+    judge: LeastSquaresProblem, k: int, error: Array, made: Array, output: Array, lost: Array,
+    demand: Array | None = None,
+) -> Expected | None:  # fmt: skip
     """The noise that the ``error`` of output ``k`` is, float64[samples] in its unit; None: it is none.
 
     made    mean square of what draws of noise in a driving channel make of it, float64[samples]
     output  as it was logged: in its quietest windows there is no less than its noise
     lost    squared error that the rows make expect in each sample, in squared noise floors, 1 on average
+    demand  that the output follows; None: none is logged
     """
     stage, floor = judge.stage, float(judge.floor[k])
     bins = [b for values in stage.regimes.values() if (b := bins_of(judge, k, values)) is not None]
@@ -165,9 +190,8 @@ def _noise_in(
     if whole <= ((1.0 + FLOOR_KNOWN) * floor) ** 2:
         return Expected(floor, 0.0)
     counted = np.where(judge.valid[k], error, np.nan)
-    own_most = QUIET_KNOWN_TO**2 * _power(
-        _quietest(_windows(stage, np.where(judge.valid[k], output, np.nan), stage.window))
-    )
+    quietest = _quietest(*_windows_of(stage, np.where(judge.valid[k], output, np.nan), demand, stage.window))
+    own_most = QUIET_KNOWN_TO**2 * _power(quietest)
     weight = 1.0 / (np.sqrt(count) * whole)
     a = np.array([whole * count, through.sum(axis=1), uneven.sum(axis=1)]).T
     most = np.array([own_most / whole, QUIET_KNOWN_TO**2, 1.0])
@@ -234,6 +258,18 @@ def _of_parameters(judge: LeastSquaresProblem, theta: Array) -> Array:
     return np.array(out)
 
 
+def _explained(judge: LeastSquaresProblem) -> bool:
+    """Whether one effect of the library explains the error: it is accepted, and leaves hardly more than the floor."""
+    search = Search(LikelihoodAcceptance(judge))
+    criterion, effects = search.criterion, judge.stage.effects
+    if search.quiet or not effects:
+        return False
+    best = min(search.singles([e.name for e in effects]).values(), key=criterion.order)
+    criterion.learn(best)
+    accepted = criterion.accepts(search.base, best)
+    return accepted and criterion.conclude(search.base, best, [], [], []).verdict == "missing"
+
+
 def bounded(a: Array, b: Array, most: Array) -> Array:
     """The least squares of a x = b, float64[rows, n], with each x from 0 to ``most``, which may be infinite: the best
     of those with some x on an edge and the others inside.
@@ -249,14 +285,21 @@ def bounded(a: Array, b: Array, most: Array) -> Array:
     return min(tried, key=lambda x: float(np.sum((a @ x - b) ** 2)))
 
 
-def _quietest(windows: Array) -> Array:
-    """The quietest tenth of windows, float64[windows, samples], beside their trend: at least one, if there is any."""
-    if not len(windows):
-        return windows
+def _quietest(windows: Array, by: Array | None = None) -> Array:
+    """The tenth of windows, float64[windows, samples], in which the machine moves least, beside their trend: at least
+    one, if there is any.
+
+    by  what tells how the machine moves in them: the demand, for those that move least themselves have less slow noise
+        than the others. None: themselves
+    """
+    moves = _detrended(windows if by is None else by).std(axis=1)
+    return _detrended(windows[np.argsort(moves, kind="stable")[: max(1, round(0.1 * len(windows)))]])
+
+
+def _detrended(windows: Array) -> Array:
     place = np.linspace(-1.0, 1.0, windows.shape[1])
     level = windows - windows.mean(axis=1, keepdims=True)
-    level = level - np.outer(level @ place / (place @ place), place)
-    return np.asarray(level[np.argsort(level.std(axis=1))[: max(1, round(0.1 * len(level)))]])
+    return np.asarray(level - np.outer(level @ place / (place @ place), place))
 
 
 def _power(windows: Array) -> float:
